@@ -1,0 +1,66 @@
+"""The one tree of errors that simtrack raises.
+
+Every message says what was wrong, where, and what would have been valid. A stage that merely fails on one frame does not
+raise: it reports a status (see `simtrack.contracts.Status`) and keeps its state.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class SimtrackError(Exception):
+    """Base of all errors raised by simtrack."""
+
+
+class UnknownNameError(SimtrackError):
+    """A scene, object, agent, detector or other registered name that does not exist."""
+
+    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        self.kind, self.name, self.known = kind, name, sorted(known)
+        listing = ", ".join(self.known) if self.known else "(none)"
+        super().__init__(f"unknown {kind} '{name}'. Known: {listing}")
+
+
+class FileFormatError(SimtrackError):
+    """A file that cannot be used: names the file, the field and the reason."""
+
+    def __init__(self, path: str | Path, field: str, reason: str) -> None:
+        self.path, self.field, self.reason = Path(path), field, reason
+        where = f"{path}: {field}" if field else f"{path}"
+        super().__init__(f"{where}: {reason}")
+
+
+class MeshError(SimtrackError):
+    """A mesh that is missing, empty, non-finite or without area."""
+
+    def __init__(self, source: str | Path, reason: str) -> None:
+        self.source, self.reason = str(source), reason
+        super().__init__(f"mesh {source}: {reason}")
+
+
+class InvalidValueError(SimtrackError, ValueError):
+    """An argument or configuration value outside its domain."""
+
+    def __init__(self, name: str, value: object, allowed: str) -> None:
+        self.name, self.value, self.allowed = name, value, allowed
+        super().__init__(f"{name} = {value!r} is not valid; allowed: {allowed}")
+
+
+class RaycastError(SimtrackError):
+    """Embree refused a call or could not be loaded."""
+
+
+class RenderingError(SimtrackError):
+    """No renderer could be created, or a rendering call failed."""
+
+
+class OutputExistsError(SimtrackError):
+    """The output folder exists and overwriting was not asked for."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        super().__init__(f"output folder {path} exists already; choose another --out or pass --overwrite")
+
+
+class QueryError(SimtrackError):
+    """A scene-graph query that cannot be parsed or names unknown things."""
