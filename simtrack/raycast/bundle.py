@@ -1,0 +1,198 @@
+"""Bundles of rays in a sensor's frame, packed once so that neighbouring rays are traced together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from simtrack.contracts import CameraIntrinsics, Float32, Int32
+from simtrack.errors import InvalidValueError
+from simtrack.raycast import embree as rtc
+
+
+def packet_width() -> int:
+    """Rays in a packet: the CPU's native width, or 8 where the library is not reached (the fallback ignores it)."""
+    return rtc.embree().packet_width if rtc.available() else 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayBundle:
+    """Rays that leave one point, in the frame of their sensor, with the order in which packets take them."""
+
+    directions: Float32
+    """(N, 3), sensor frame, in the caller's order; need not be unit vectors."""
+    order: Int32
+    """(P,), ray of each packet lane, P a multiple of the packet width; the last ray of a group fills spare lanes."""
+    packed: Float32
+    """(P / width, 3, width), the directions in packet order."""
+    pixels: Int32 | None = None
+    """(N,), flat pixel index ``row * image width + column`` of each ray, None for a bundle without an image."""
+    shape: tuple[int, ...] = ()
+    """Shape of the pixel grid for `from_camera`, so that ``hits.distances.reshape(bundle.shape)`` is an image."""
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    @staticmethod
+    def from_camera(
+        intrinsics: CameraIntrinsics, stride: int = 1, window: tuple[int, int, int, int] | None = None
+    ) -> "RayBundle":
+        """Rays through pixel centres, row by row, with z = 1: the distance along a ray is depth along the optical axis.
+
+        Args:
+            intrinsics: the camera.
+            stride: every `stride`-th column and row, at pixel coordinates (u, v) that are multiples of it, so that
+                windows of equal stride share pixels.
+            window: half-open pixel box (u0, v0, u1, v1), clipped to the image; the whole image if None.
+
+        Raises:
+            InvalidValueError: `stride` below 1.
+        """
+        if stride < 1:
+            raise InvalidValueError("stride", stride, ">= 1")
+        u0, v0, u1, v1 = _clip(window, intrinsics)
+        columns = np.arange(-(-u0 // stride) * stride, u1, stride, dtype=np.int32)
+        rows = np.arange(-(-v0 // stride) * stride, v1, stride, dtype=np.int32)
+        pixels = (rows[:, None] * intrinsics.width + columns).ravel()
+        return _from_pixels(intrinsics, pixels, stride, (len(rows), len(columns)))
+
+    @staticmethod
+    def from_pixels(intrinsics: CameraIntrinsics, pixels: npt.ArrayLike) -> "RayBundle":
+        """Rays through the given pixels, in the given order, packed along a Morton curve; z = 1.
+
+        Args:
+            intrinsics: the camera.
+            pixels: (N,) flat pixel indices ``row * width + column``.
+
+        Raises:
+            InvalidValueError: an index outside the image.
+        """
+        flat = np.ascontiguousarray(pixels, np.int32).ravel()
+        count = intrinsics.width * intrinsics.height
+        if flat.size and not (flat.min() >= 0 and flat.max() < count):
+            raise InvalidValueError("pixels", (int(flat.min()), int(flat.max())), f"flat indices 0..{count - 1}")
+        return _from_pixels(intrinsics, flat, 1, (len(flat),))
+
+    @staticmethod
+    def from_windows(
+        intrinsics: CameraIntrinsics, windows: Sequence[tuple[int, int, int, int]], strides: Sequence[int] | int = 1
+    ) -> "RayBundle":
+        """Rays of the union of several windows (see `from_camera`), each with its stride, every pixel once, row-major."""
+        steps = [strides] * len(windows) if isinstance(strides, int) else list(strides)
+        if len(steps) != len(windows) or min(steps, default=1) < 1:
+            raise InvalidValueError("strides", strides, f"one number >= 1, or {len(windows)} of them")
+        mask = np.zeros((intrinsics.height, intrinsics.width), bool)
+        for window, step in zip(windows, steps, strict=True):
+            u0, v0, u1, v1 = _clip(window, intrinsics)
+            mask[-(-v0 // step) * step : v1 : step, -(-u0 // step) * step : u1 : step] = True
+        return RayBundle.from_pixels(intrinsics, np.flatnonzero(mask))
+
+    @staticmethod
+    def from_directions(directions: npt.ArrayLike, groups: npt.ArrayLike | None = None) -> "RayBundle":
+        """Rays along given directions, packed in their order, or group by group.
+
+        Args:
+            directions: (N, 3), sensor frame; distances are measured in multiples of their length.
+            groups: (N,) integers, e.g. a lidar's rings: packets hold rays of one group, in the caller's order inside it.
+
+        Raises:
+            InvalidValueError: wrong shape, or a direction that is not finite.
+        """
+        rays = np.ascontiguousarray(directions, np.float32)
+        if rays.ndim != 2 or rays.shape[1] != 3 or not np.isfinite(rays).all():
+            raise InvalidValueError("directions", rays.shape, "finite (N, 3)")
+        labels = np.zeros(len(rays), np.int64) if groups is None else np.asarray(groups)
+        if labels.shape != (len(rays),):
+            raise InvalidValueError("groups", labels.shape, f"({len(rays)},) integers")
+        width = packet_width()
+        lanes: list[np.ndarray] = []
+        for members in np.split(np.argsort(labels, kind="stable"), _group_starts(labels)):
+            spare = -len(members) % width
+            lanes.append(np.concatenate([members, np.repeat(members[-1:], spare)]))
+        order = np.concatenate(lanes).astype(np.int32) if len(rays) else np.empty(0, np.int32)
+        packed = np.ascontiguousarray(rays[order].reshape(-1, width, 3).transpose(0, 2, 1))
+        return RayBundle(rays, order, packed)
+
+
+def _group_starts(labels: np.ndarray) -> np.ndarray:
+    _, counts = np.unique(labels, return_counts=True)
+    return np.cumsum(counts)[:-1]
+
+
+def _clip(window: tuple[int, int, int, int] | None, intrinsics: CameraIntrinsics) -> tuple[int, int, int, int]:
+    u0, v0, u1, v1 = (0, 0, intrinsics.width, intrinsics.height) if window is None else (int(x) for x in window)
+    return max(u0, 0), max(v0, 0), min(u1, intrinsics.width), min(v1, intrinsics.height)
+
+
+@lru_cache(maxsize=8)
+def _camera_tables(intrinsics: CameraIntrinsics, stride: int) -> tuple[npt.NDArray[np.int64], ...]:
+    """Morton code of each column and each row on the grid of `stride`: a pixel's code is their sum."""
+    return tuple(_spread_bits(np.arange(n) // stride) << shift for n, shift in ((intrinsics.width, 0), (intrinsics.height, 1)))
+
+
+def _spread_bits(value: np.ndarray) -> npt.NDArray[np.int64]:
+    """Bits of a 16-bit number moved to the even places."""
+    out = value.astype(np.int64)
+    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        out = (out | (out << shift)) & mask
+    return out
+
+
+def _from_pixels(intrinsics: CameraIntrinsics, pixels: Int32, stride: int, shape: tuple[int, ...]) -> RayBundle:
+    columns, rows = _camera_tables(intrinsics, stride)
+    camera = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
+    directions, order, packed = _pack_pixels(pixels, intrinsics.width, columns, rows, *camera, packet_width())
+    return RayBundle(directions, order, packed, pixels, shape)
+
+
+@nb.njit(cache=True, nogil=True)
+def _pack_pixels(pixels, image_width, columns, rows, fx, fy, cx, cy, width):  # noqa: ANN001, ANN202
+    """Directions (N, 3), packet order (P,) along the Morton curve, and directions in that order (P / width, 3, width).
+
+    Eight consecutive pixels of a filled image along the curve are a 4x2 tile, sixteen a 4x4 tile; sparse and strided
+    sets stay as compact as they can be. Sorted by two stable counting passes.
+    """
+    n = pixels.shape[0]
+    directions = np.empty((n, 3), np.float32)
+    codes = np.empty(n, np.int64)
+    for i in range(n):
+        v = pixels[i] // image_width
+        u = pixels[i] - v * image_width
+        codes[i] = columns[u] + rows[v]
+        directions[i, 0] = (u - cx) / fx
+        directions[i, 1] = (v - cy) / fy
+        directions[i, 2] = 1.0
+    bits = 1
+    while (columns[-1] + rows[-1]) >> (2 * bits):
+        bits += 1
+    packets = (n + width - 1) // width
+    order = np.empty(packets * width, np.int32)
+    first = np.empty(n, np.int32)
+    for step in range(2):
+        start = np.zeros((1 << bits) + 1, np.int64)
+        mask = (1 << bits) - 1
+        shift = step * bits
+        for i in range(n):
+            start[((codes[i] >> shift) & mask) + 1] += 1
+        for b in range(1 << bits):
+            start[b + 1] += start[b]
+        for j in range(n):
+            i = j if step == 0 else first[j]
+            digit = (codes[i] >> shift) & mask
+            if step == 0:
+                first[start[digit]] = i
+            else:
+                order[start[digit]] = i
+            start[digit] += 1
+    for lane in range(n, packets * width):
+        order[lane] = order[n - 1]
+    packed = np.empty((packets, 3, width), np.float32)
+    for p in range(packets):
+        for k in range(width):
+            i = order[p * width + k]
+            for axis in range(3):
+                packed[p, axis, k] = directions[i, axis]
+    return directions, order, packed

@@ -1,0 +1,83 @@
+"""Casting without instances: `embreex`'s single rays against each mesh in its own frame."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from simtrack.contracts import Float32, Float64
+
+if TYPE_CHECKING:
+    from simtrack.raycast.scene import Instance, RayHits
+
+
+def cast(
+    instances: "Mapping[int, Instance]",
+    origins: Float32,
+    directions: Float32,
+    times: np.ndarray,
+    near: np.float32,
+    far: np.float32,
+    hits: "RayHits",
+) -> None:
+    """Fill `hits`: rays go to the frame of every instance that their bounding sphere lets them reach; the nearest wins.
+
+    The direction keeps its scale on the way, so distances along the ray are those of the map frame.
+    """
+    hits.distances[:], hits.normals[:], hits.faces[:], hits.instances[:] = np.inf, 0.0, -1, -1
+    usable = np.isfinite(origins).all(1) & np.isfinite(directions).all(1) & (directions != 0).any(1)
+    if len(times):
+        usable &= np.isfinite(times)
+    for number in sorted(instances):
+        entry = instances[number]
+        if not entry.enabled:
+            continue
+        T_map_mesh = _pose_at(entry.keys, times)
+        rays = np.flatnonzero(usable)
+        T = T_map_mesh if T_map_mesh.ndim == 2 else T_map_mesh[rays]
+        T_mesh_map = np.linalg.inv(T)
+        local_directions = np.einsum("...ij,nj->ni" if T.ndim == 2 else "nij,nj->ni", T_mesh_map[..., :3, :3], directions[rays])
+        shifted = origins[rays] - T[..., :3, 3]
+        local_origins = np.einsum("...ij,nj->ni" if T.ndim == 2 else "nij,nj->ni", T_mesh_map[..., :3, :3], shifted)
+        _keep_nearest(entry, number, rays, local_origins, local_directions, T_mesh_map, (near, far), hits)
+
+
+def _keep_nearest(
+    entry: "Instance",
+    number: int,
+    rays: np.ndarray,
+    origins: Float64,
+    directions: Float64,
+    T_mesh_map: Float64,
+    limits: tuple[np.float32, np.float32],
+    hits: "RayHits",
+) -> None:
+    centre, radius = entry.mesh.bounding_sphere
+    towards = centre - origins
+    nearest = np.clip((towards * directions).sum(1) / (directions**2).sum(1), 0.0, None)
+    reach = ((towards - nearest[:, None] * directions) ** 2).sum(1) <= (1.001 * radius + 1e-6) ** 2
+    if not reach.any():
+        return
+    origins = origins[reach] + float(limits[0]) * directions[reach]
+    output = entry.mesh.embreex_scene.run(
+        origins.astype(np.float32), directions[reach].astype(np.float32), output=True
+    )
+    distances = output["tfar"] + limits[0]
+    better = (output["primID"] >= 0) & (distances < hits.distances[rays[reach]]) & (distances <= limits[1])
+    chosen = rays[reach][better]
+    hits.distances[chosen] = distances[better]
+    hits.faces[chosen] = output["primID"][better]
+    hits.instances[chosen] = number
+    inverse = T_mesh_map[..., :3, :3] if T_mesh_map.ndim == 2 else T_mesh_map[reach][better][:, :3, :3]
+    normals = np.einsum("ji,nj->ni" if inverse.ndim == 2 else "nji,nj->ni", inverse, output["Ng"][better].astype(np.float64))
+    hits.normals[chosen] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _pose_at(keys: Float64, times: np.ndarray) -> Float64:
+    """(4, 4) for an instance at rest, else (N, 4, 4): matrices between keys are interpolated linearly."""
+    if len(keys) == 1 or not len(times):
+        return keys[0]
+    position = np.clip(np.nan_to_num(times.astype(np.float64)), 0.0, 1.0) * (len(keys) - 1)
+    segment = np.minimum(position.astype(int), len(keys) - 2)
+    fraction = (position - segment)[:, None, None]
+    return (1.0 - fraction) * keys[segment] + fraction * keys[segment + 1]

@@ -1,0 +1,435 @@
+"""A scene of mesh instances: cast rays at it, ask what is occluded and what lies nearest."""
+
+import weakref
+from dataclasses import dataclass, field
+from threading import RLock
+from types import TracebackType
+
+import numpy as np
+import numpy.typing as npt
+
+from simtrack.contracts import Bool, Float32, Float64, Int32
+from simtrack.errors import InvalidValueError, RaycastError
+from simtrack.raycast import embree as rtc
+from simtrack.raycast.bundle import RayBundle
+from simtrack.raycast.mesh import TriangleMesh
+
+MAX_INSTANCE = 1 << 16
+"""Instance ids are below this: tables are indexed by them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayHits:
+    """What rays met, in the caller's order of rays."""
+
+    distances: Float32
+    """(N,), in multiples of the direction's length (metres for unit directions; depth for z = 1), inf = miss."""
+    normals: Float32
+    """(N, 3), unit, map frame, on the side that the mesh's winding faces; zero for a miss.
+
+    Normals move with the inverse transpose of the instance's transform, so the outside of a closed mesh stays its
+    outside under a mirroring transform too (as if the mirrored mesh's faces had been flipped, which trimesh does).
+    """
+    faces: Int32
+    """(N,), face index in the instance's mesh, -1 = miss."""
+    instances: Int32
+    """(N,), instance id, -1 = miss."""
+
+    @staticmethod
+    def empty(count: int) -> "RayHits":
+        """Uninitialised arrays for `count` rays, to be handed to `cast(..., out=)` again and again."""
+        return RayHits(
+            np.empty(count, np.float32),
+            np.empty((count, 3), np.float32),
+            np.empty(count, np.int32),
+            np.empty(count, np.int32),
+        )
+
+    @property
+    def hit(self) -> Bool:
+        """(N,), whether the ray met anything."""
+        return self.instances >= 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosestPoints:
+    """The nearest surface points, in the order of the query points."""
+
+    points: Float32
+    """(N, 3), map frame, metres; the query point itself where nothing lies within the maximum distance."""
+    distances: Float32
+    """(N,), metres, inf = nothing within the maximum distance."""
+    instances: Int32
+    """(N,), instance id, -1 = nothing."""
+    faces: Int32
+    """(N,), face index in the instance's mesh, -1 = nothing."""
+
+
+@dataclass(slots=True, eq=False)
+class Instance:
+    """A mesh in the scene."""
+
+    mesh: TriangleMesh
+    keys: Float64
+    """(K, 4, 4), T_map_mesh at equidistant times 0..1; K = 1 at rest."""
+    enabled: bool = True
+    geometry: int = field(default=0)
+    """Address of the RTCGeometry, 0 in the fallback."""
+
+
+class RayScene:
+    """Instances of triangle meshes under one hierarchy.
+
+    Moving an instance costs microseconds plus `commit`; meshes are shared, never copied. Casting is thread-safe and
+    releases the interpreter lock; changing the scene while another thread casts is not allowed (changes are serialised
+    among themselves). The threads used are ``numba.get_num_threads()``; results do not depend on their number.
+    """
+
+    def __init__(self, fallback: bool | None = None) -> None:
+        """Create an empty scene.
+
+        Args:
+            fallback: True casts with `embreex`'s single rays (same results, an order of magnitude slower); None does
+                so where the library cannot be reached or the environment sets ``SIMTRACK_RAYCAST=fallback``.
+
+        Raises:
+            RaycastError: `fallback` is False and the library cannot be used.
+        """
+        self.fallback = (rtc.fallback_forced() or not rtc.available()) if fallback is None else fallback
+        self._instances: dict[int, Instance] = {}
+        self._lock = RLock()
+        self._dirty = True
+        self._top = 0
+        self._closed = False
+        self._table: object = None
+        if not self.fallback:
+            api = rtc.embree().api
+            self._top = api.rtcNewScene(rtc.embree().device)
+            api.rtcSetSceneFlags(self._top, rtc.RTC_SCENE_FLAG_DYNAMIC)
+            rtc.embree().check("rtcNewScene")
+            self._release = weakref.finalize(self, api.rtcReleaseScene, self._top)
+
+    # ------------------------------------------------------------------------------------------------ what is in it
+
+    @property
+    def instances(self) -> tuple[int, ...]:
+        """Ids of all instances, ascending."""
+        return tuple(sorted(self._instances))
+
+    def mesh(self, instance: int) -> TriangleMesh:
+        """The mesh of an instance."""
+        return self._get(instance).mesh
+
+    def pose(self, instance: int) -> Float64:
+        """(4, 4) T_map_mesh of an instance (of its first motion key)."""
+        return self._get(instance).keys[0].copy()
+
+    def add(self, mesh: TriangleMesh, T_map_mesh: npt.ArrayLike | None = None, instance: int | None = None) -> int:
+        """Place an instance of `mesh`.
+
+        Args:
+            mesh: the mesh, shared.
+            T_map_mesh: (4, 4) affine transform, identity if None; may scale, shear and mirror, not collapse.
+            instance: the id that results carry; the smallest free one if None. Ids outlive the removal of others.
+
+        Returns:
+            The id.
+
+        Raises:
+            InvalidValueError: the id is taken or out of range, or the transform is not an invertible affine one.
+        """
+        keys = _checked_transforms(np.eye(4) if T_map_mesh is None else T_map_mesh, "T_map_mesh")
+        with self._lock:
+            self._open()
+            number = next(i for i in range(MAX_INSTANCE + 1) if i not in self._instances) if instance is None else instance
+            if number in self._instances or not 0 <= number < MAX_INSTANCE:
+                raise InvalidValueError("instance", number, f"0..{MAX_INSTANCE - 1} and not one of {self.instances}")
+            entry = Instance(mesh, keys)
+            if not self.fallback:
+                self._attach(entry, number)
+            self._instances[number] = entry
+            self._dirty = True
+        return number
+
+    def remove(self, instance: int) -> None:
+        """Take an instance out; its id becomes free, the others keep theirs."""
+        with self._lock:
+            entry = self._get(instance)
+            if entry.geometry:
+                rtc.embree().api.rtcDetachGeometry(self._top, instance)
+                rtc.embree().check("rtcDetachGeometry")
+            del self._instances[instance]
+            self._dirty = True
+
+    def set_pose(self, instance: int, T_map_mesh: npt.ArrayLike) -> None:
+        """Move an instance to the (4, 4) affine transform `T_map_mesh` and end any motion of it."""
+        self._set_keys(instance, _checked_transforms(T_map_mesh, "T_map_mesh"))
+
+    def set_motion(self, instance: int, T_keys: npt.ArrayLike) -> None:
+        """Let an instance move during ray time 0..1.
+
+        Args:
+            instance: its id.
+            T_keys: (K, 4, 4) T_map_mesh at K = 1..129 equidistant times from 0 to 1; between them the matrices are
+                interpolated linearly, element by element (so keys of a rotating body must be close to one another).
+        """
+        keys = _checked_transforms(T_keys, "T_keys")
+        if not 1 <= len(keys) <= rtc.RTC_MAX_TIME_STEP_COUNT:
+            raise InvalidValueError("T_keys", keys.shape, f"1..{rtc.RTC_MAX_TIME_STEP_COUNT} keys")
+        self._set_keys(instance, keys)
+
+    def set_enabled(self, instance: int, enabled: bool) -> None:
+        """Show an instance to rays and queries, or hide it."""
+        with self._lock:
+            entry = self._get(instance)
+            if entry.enabled == enabled:
+                return
+            entry.enabled = enabled
+            if entry.geometry:
+                api = rtc.embree().api
+                (api.rtcEnableGeometry if enabled else api.rtcDisableGeometry)(entry.geometry)
+                api.rtcCommitGeometry(entry.geometry)
+            self._dirty = True
+
+    def commit(self) -> None:
+        """Make changes effective; casting does it by itself where needed.
+
+        Raises:
+            RaycastError: Embree could not build the scene.
+        """
+        with self._lock:
+            self._open()
+            if not self._dirty:
+                return
+            if not self.fallback:
+                rtc.embree().api.rtcCommitScene(self._top)
+                rtc.embree().check("rtcCommitScene")
+                self._table = self._instance_table()
+            self._dirty = False
+
+    # ------------------------------------------------------------------------------------------------------ queries
+
+    def cast(
+        self,
+        bundle: RayBundle,
+        T_map_sensor: npt.ArrayLike,
+        max_distance: float = np.inf,
+        *,
+        min_distance: float = 0.0,
+        time: float = 0.0,
+        out: RayHits | None = None,
+    ) -> RayHits:
+        """Cast a bundle from one sensor pose.
+
+        Args:
+            bundle: the rays.
+            T_map_sensor: (4, 4).
+            max_distance: farthest hit, in multiples of the directions' length.
+            min_distance: nearest hit, likewise.
+            time: of moving instances, 0..1.
+            out: results to overwrite and return (from `RayHits.empty`); saves the allocation.
+        """
+        T = _checked_transforms(T_map_sensor, "T_map_sensor")[0]
+        self.commit()
+        hits = _outputs(out, len(bundle))
+        rotation, origin = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
+        limits = np.float32(min_distance), np.float32(max_distance)
+        if self.fallback:
+            from simtrack.raycast import fallback
+
+            rays = bundle.directions @ rotation.T
+            times = np.full(len(bundle), time)
+            fallback.cast(self._instances, np.broadcast_to(origin, rays.shape), rays, times, *limits, hits)
+        elif len(bundle):
+            self._run(
+                "cast_bundle", bundle.packed, bundle.order, rotation, origin, *limits, np.float32(time),
+                self._table, hits.distances, hits.normals, hits.faces, hits.instances,
+            )  # fmt: skip
+        return hits
+
+    def cast_rays(
+        self,
+        origins: npt.ArrayLike,
+        directions: npt.ArrayLike,
+        times: npt.ArrayLike | None = None,
+        max_distance: float = np.inf,
+        *,
+        min_distance: float = 0.0,
+        packing: RayBundle | None = None,
+        out: RayHits | None = None,
+    ) -> RayHits:
+        """Cast rays that each have their own origin and time.
+
+        Args:
+            origins: (N, 3), map frame, metres.
+            directions: (N, 3), map frame, any length. A ray that is not finite or has no direction misses.
+            times: (N,), 0..1, for moving instances; 0 if None.
+            max_distance: farthest hit, in multiples of the direction's length.
+            min_distance: nearest hit, likewise.
+            packing: a bundle of N rays whose packet order is used, e.g. a lidar's ring by ring: faster than the
+                caller's order where that puts neighbours far apart.
+            out: results to overwrite and return.
+        """
+        rays = _checked_rays(origins, directions, times, packing)
+        self.commit()
+        hits = _outputs(out, len(rays[0]))
+        limits = np.float32(min_distance), np.float32(max_distance)
+        if self.fallback:
+            from simtrack.raycast import fallback
+
+            fallback.cast(self._instances, *rays[:3], *limits, hits)
+        elif len(rays[0]):
+            self._run(
+                "cast_rays", *rays, *limits, packing is not None,
+                self._table, hits.distances, hits.normals, hits.faces, hits.instances,
+            )  # fmt: skip
+        return hits
+
+    def occluded(
+        self,
+        origins: npt.ArrayLike,
+        directions: npt.ArrayLike,
+        distances: npt.ArrayLike,
+        times: npt.ArrayLike | None = None,
+        *,
+        min_distance: float = 0.0,
+    ) -> Bool:
+        """(N,), whether anything lies on the ray between `min_distance` and its (N,) distance (see `cast_rays`)."""
+        rays = _checked_rays(origins, directions, times, None)
+        limit = np.ascontiguousarray(np.broadcast_to(np.asarray(distances, np.float32), (len(rays[0]),)))
+        self.commit()
+        if self.fallback:
+            from simtrack.raycast import fallback
+
+            hits = RayHits.empty(len(limit))
+            fallback.cast(self._instances, *rays[:3], np.float32(min_distance), np.float32(np.inf), hits)
+            return hits.distances < limit
+        blocked = np.zeros(len(limit), np.bool_)
+        if len(limit):
+            self._run("occluded", *rays, np.float32(min_distance), limit, blocked)
+        return blocked
+
+    # -------------------------------------------------------------------------------------------------- life and end
+
+    def close(self) -> None:
+        """Release the scene; using it afterwards raises RaycastError."""
+        with self._lock:
+            if not self._closed and not self.fallback:
+                self._release()
+            self._closed = True
+            self._instances.clear()
+
+    def __enter__(self) -> "RayScene":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # ------------------------------------------------------------------------------------------------------ internals
+
+    def _open(self) -> None:
+        if self._closed:
+            raise RaycastError("the ray scene is closed")
+
+    def _get(self, instance: int) -> Instance:
+        self._open()
+        entry = self._instances.get(instance)
+        if entry is None:
+            raise InvalidValueError("instance", instance, f"one of {self.instances}")
+        return entry
+
+    def _attach(self, entry: Instance, number: int) -> None:
+        api = rtc.embree().api
+        entry.geometry = api.rtcNewGeometry(rtc.embree().device, rtc.RTC_GEOMETRY_TYPE_INSTANCE)
+        api.rtcSetGeometryInstancedScene(entry.geometry, entry.mesh.scene_handle)
+        _write_keys(entry)
+        api.rtcAttachGeometryByID(self._top, entry.geometry, number)
+        api.rtcReleaseGeometry(entry.geometry)  # the scene keeps it
+        rtc.embree().check("rtcAttachGeometryByID")
+
+    def _set_keys(self, instance: int, keys: Float64) -> None:
+        with self._lock:
+            entry = self._get(instance)
+            entry.keys = keys
+            if entry.geometry:
+                _write_keys(entry)
+            self._dirty = True
+
+    def _instance_table(self) -> object:
+        from simtrack.raycast.kernels import InstanceTable
+
+        size = max(self._instances, default=-1) + 1
+        normal = np.zeros((size, 3, 3), np.float32)
+        start, count = np.zeros(size, np.int32), np.ones(size, np.int32)
+        keys: list[np.ndarray] = [np.zeros((0, 3, 3))]
+        rows = 0
+        for number, entry in self._instances.items():
+            linear = entry.keys[:, :3, :3]
+            matrix = np.linalg.inv(linear[0]).T
+            normal[number] = matrix / np.abs(matrix).max()
+            if len(linear) > 1:
+                start[number], count[number] = rows, len(linear)
+                keys.append(linear)
+                rows += len(linear)
+        return InstanceTable(normal, start, count, np.concatenate(keys).astype(np.float32))
+
+    def _run(self, query: str, *arguments: object) -> None:
+        from simtrack.raycast import kernels
+
+        width = rtc.embree().packet_width
+        kernels.run(width, query, self._top, *arguments)
+
+
+def _write_keys(entry: Instance) -> None:
+    api = rtc.embree().api
+    api.rtcSetGeometryTimeStepCount(entry.geometry, len(entry.keys))
+    for step, key in enumerate(entry.keys):
+        columns = np.ascontiguousarray(key[:3].T, np.float32)
+        layout = rtc.RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR
+        api.rtcSetGeometryTransform(entry.geometry, step, layout, columns.ctypes.data)
+    api.rtcCommitGeometry(entry.geometry)
+    rtc.embree().check("rtcSetGeometryTransform")
+
+
+def _checked_transforms(T: npt.ArrayLike, name: str) -> Float64:
+    """(K, 4, 4) copy of one or several affine transforms."""
+    keys = np.array(T, dtype=np.float64)
+    if keys.ndim == 2:
+        keys = keys[None]
+    allowed = "finite invertible affine 4x4 with last row 0 0 0 1"
+    if keys.ndim != 3 or keys.shape[1:] != (4, 4) or not len(keys):
+        raise InvalidValueError(name, keys.shape, allowed)
+    if not np.isfinite(keys).all() or (keys[:, 3] != (0.0, 0.0, 0.0, 1.0)).any():
+        raise InvalidValueError(name, keys.tolist(), allowed)
+    if (np.abs(np.linalg.det(keys[:, :3, :3])) < 1e-18).any():
+        raise InvalidValueError(name, keys.tolist(), allowed)
+    return keys
+
+
+def _checked_rays(
+    origins: npt.ArrayLike, directions: npt.ArrayLike, times: npt.ArrayLike | None, packing: RayBundle | None
+) -> tuple[Float32, Float32, Float32, Int32]:
+    starts, rays = np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32)
+    if rays.ndim != 2 or rays.shape[1] != 3 or starts.shape != rays.shape:
+        raise InvalidValueError("origins, directions", (starts.shape, rays.shape), "two arrays (N, 3)")
+    count = len(rays)
+    moments = np.empty(0, np.float32) if times is None else np.ascontiguousarray(times, np.float32)
+    if times is not None and moments.shape != (count,):
+        raise InvalidValueError("times", moments.shape, f"({count},)")
+    if packing is not None:
+        if len(packing) != count:
+            raise InvalidValueError("packing", len(packing), f"a bundle of {count} rays")
+        return starts, rays, moments, packing.order
+    width = rtc.embree().packet_width if rtc.available() else 1
+    order = np.minimum(np.arange(-(-count // width) * width, dtype=np.int32), np.int32(max(count - 1, 0)))
+    return starts, rays, moments, order
+
+
+def _outputs(out: RayHits | None, count: int) -> RayHits:
+    if out is None:
+        return RayHits.empty(count)
+    if len(out.distances) != count:
+        raise InvalidValueError("out", len(out.distances), f"results for {count} rays")
+    return out
