@@ -1,0 +1,372 @@
+"""Scene files: what is simulated, as a validated YAML document.
+
+A scene is a folder with a ``scene.yaml``. Scenes are looked for by name in the folders of ``$SIMTRACK_SCENES``, in the
+checkout's ``scenes/`` and in the installed package's data. Units are metres, radians and seconds throughout; whatever
+is written as a pair ``[low, high]`` is drawn anew for each seed.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+from simtrack.errors import FileFormatError, UnknownNameError
+from simtrack.paths import scene_roots
+
+FILE_NAME = "scene.yaml"
+MAX_BYTES = 1_000_000
+MAX_INSTANCES = 200
+PI = 3.141592653589793
+
+Name: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+Range: TypeAlias = tuple[float, float]
+Vector: TypeAlias = tuple[float, float, float]
+
+
+class _Strict(BaseModel):
+    """Refuses unknown fields by naming the known ones, and pairs [low, high] that are the wrong way round."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _known_fields(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            known = {field.alias or name for name, field in cls.model_fields.items()}
+            if unknown := sorted(str(key) for key in data if key not in known):
+                message = "unknown field {unknown}; allowed: {known}"
+                raise PydanticCustomError(
+                    "unknown_field", message, {"unknown": ", ".join(unknown), "known": ", ".join(sorted(known))}
+                )
+        return data
+
+    @model_validator(mode="after")
+    def _ordered_ranges(self) -> "_Strict":
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            if (
+                isinstance(value, tuple)
+                and len(value) == 2
+                and "float" in str(field.annotation)
+                and value[0] > value[1]
+            ):
+                raise PydanticCustomError("range", "{name} is [low, high] and low must not exceed high", {"name": name})
+        return self
+
+
+class Pose(_Strict):
+    """A pose in the map."""
+
+    xyz: Vector
+    """Metres."""
+    rpy: Vector = (0.0, 0.0, 0.0)
+    """Radians: Rz(yaw) Ry(pitch) Rx(roll)."""
+
+
+class Placement(_Strict):
+    """Where a thing stands at time 0, before physics has settled it. Give either `on` or `pose`."""
+
+    on: str | None = None
+    """Name of a furniture part of the static world with a support face."""
+    face: int = Field(default=0, ge=0)
+    """Which of the part's support faces."""
+    x: Range | None = None
+    """Metres along the face's x from its centre; by default the whole face."""
+    y: Range | None = None
+    yaw: Range = (-PI, PI)
+    """Radians."""
+    separation: float = Field(default=0.03, ge=0.0, le=1.0)
+    """Least free distance to everything else on the face, metres."""
+    pose: Pose | None = None
+
+    @model_validator(mode="after")
+    def _one_of(self) -> "Placement":
+        if (self.on is None) == (self.pose is None):
+            raise PydanticCustomError("placement", "give either 'on' (name of a support) or 'pose', not both", {})
+        return self
+
+
+class SceneObject(_Strict):
+    """One object of the scene."""
+
+    model: Name
+    """Name in the object catalogue."""
+    name: Name | None = None
+    """Unique in the scene; by default the model's name."""
+    place: Placement
+
+    @property
+    def id(self) -> str:
+        """The object's name in the scene."""
+        return self.name or self.model
+
+
+class Static(_Strict):
+    """What builds the static world."""
+
+    builder: Literal["lab_room", "office_floor"]
+    config: dict[str, Any] = Field(default_factory=dict)
+    """Fields of the builder's configuration."""
+    seed: int | None = Field(default=None, ge=0)
+    """Fixes the building; by default it follows the run's seed."""
+
+
+class StartPose(_Strict):
+    """Start at a given place on the floor."""
+
+    x: float
+    y: float
+    yaw: float = 0.0
+
+
+class StartFacing(_Strict):
+    """Start in front of a piece of furniture, looking at it."""
+
+    facing: str
+    distance: Range = (1.1, 1.4)
+    """Metres from the robot's centre to the front edge."""
+    lateral: Range = (-0.1, 0.1)
+    """Metres along the edge."""
+    yaw: Range = (-0.05, 0.05)
+    """Radians off the direction that faces it."""
+
+
+class StartRoom(_Strict):
+    """Start anywhere on the free floor of a room."""
+
+    room: str
+
+
+class RobotSettings(_Strict):
+    """The robot at time 0."""
+
+    start: StartPose | StartFacing | StartRoom
+    torso: float = Field(default=0.15, ge=0.0, le=0.35)
+    head_pan: float = Field(default=0.0, ge=-1.24, le=1.24)
+    head_tilt: float = Field(default=-0.4, ge=-0.98, le=0.72)
+
+
+class Target(_Strict):
+    """Where the hand puts something: on a support, or into a container."""
+
+    on: str | None = None
+    face: int = Field(default=0, ge=0)
+    x: Range | None = None
+    y: Range | None = None
+    into: Name | None = None
+    """Name of an object of the scene that is open at the top."""
+
+    @model_validator(mode="after")
+    def _one_of(self) -> "Target":
+        if (self.on is None) == (self.into is None):
+            raise PydanticCustomError("target", "give either 'on' (name of a support) or 'into' (an object)", {})
+        return self
+
+
+class Wait(_Strict):
+    """The hand stays where it is."""
+
+    do: Literal["wait"]
+    seconds: Range
+
+
+class Carry(_Strict):
+    """The hand picks an object from above, carries it, puts it down gently and lets go."""
+
+    do: Literal["carry"]
+    object: Name
+    to: Target
+    height: Range = (0.12, 0.2)
+    """Metres that the object is lifted."""
+    speed: float = Field(default=0.4, gt=0.0, le=1.0)
+    """Peak speed, m/s."""
+    turn_rate: float = Field(default=PI / 2, ge=0.0, le=2 * PI)
+    """Peak yaw rate, rad/s."""
+    tilt: Range = (0.1, 0.5)
+    """Largest tilt on the way, radians."""
+
+
+class Push(_Strict):
+    """The hand pushes an object along its support by contact."""
+
+    do: Literal["push"]
+    object: Name
+    distance: Range = (0.05, 0.15)
+    speed: float = Field(default=0.15, gt=0.0, le=0.5)
+
+
+class Retreat(_Strict):
+    """The hand goes back to its rest place."""
+
+    do: Literal["retreat"]
+
+
+Action: TypeAlias = Annotated[Wait | Carry | Push | Retreat, Field(discriminator="do")]
+
+
+class HandSettings(_Strict):
+    """A scripted human hand; the script repeats, with new random targets, until the run ends."""
+
+    rest: Vector
+    """Where it rests between actions, map frame, metres: outside of the usual views."""
+    script: tuple[Action, ...] = Field(min_length=1, max_length=200)
+
+
+class SensorSettings(_Strict):
+    """Sensors: presets and deviations from them. Each mapping holds fields of the configuration that it names."""
+
+    depth: str = "xtion"
+    """Name of a preset of `simtrack.sensors.depth_noise`."""
+    depth_noise: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `DepthNoiseConfig` that differ from the preset."""
+    lidar_noise: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `LidarNoiseConfig`."""
+    odometry: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `OdometryNoiseConfig`."""
+    feed: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `FeedFaults`: dropped, late and duplicated frames."""
+    calibration: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `CalibrationFaults`."""
+
+
+class SceneFile(_Strict):
+    """A whole scene."""
+
+    name: Name
+    description: str = ""
+    duration: float = Field(default=20.0, gt=0.0, le=3600.0)
+    """Seconds that a run takes unless told otherwise."""
+    agent: str | None = None
+    """Name of the agent that drives unless told otherwise."""
+    static: Static
+    mjcf: str | None = None
+    """A user's MJCF file inside the scene's folder, attached to the world."""
+    objects: tuple[SceneObject, ...] = Field(default=(), max_length=MAX_INSTANCES)
+    """Objects that the tracker has models of."""
+    clutter: tuple[SceneObject, ...] = Field(default=(), max_length=MAX_INSTANCES)
+    """Things that it has no models of."""
+    robot: RobotSettings
+    hand: HandSettings | None = None
+    sensors: SensorSettings = SensorSettings()
+    survey: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `SurveyConfig`."""
+    tracker_models: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `TrackerModelConfig`: how the tracker's models differ from the simulated bodies."""
+    _path: Path = PrivateAttr(default=Path(FILE_NAME))
+
+    @property
+    def path(self) -> Path:
+        """The file that it was read from."""
+        return self._path
+
+    @property
+    def mjcf_path(self) -> Path | None:
+        """The user's MJCF file, checked to lie inside the scene's folder."""
+        return None if self.mjcf is None else self._path.parent / self.mjcf
+
+    @model_validator(mode="after")
+    def _references(self) -> "SceneFile":
+        names = [thing.id for thing in (*self.objects, *self.clutter)]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            message = "object names must be unique, but {twice} occurs more than once; give them a 'name'"
+            raise PydanticCustomError("unique", message, {"twice": ", ".join(twice)})
+        for name in self._script_names():
+            if name not in names:
+                message = "hand.script names the object '{name}'; the scene has: {names}"
+                raise PydanticCustomError("reference", message, {"name": name, "names": ", ".join(sorted(names))})
+        return self
+
+    def _script_names(self) -> Iterator[str]:
+        for action in self.hand.script if self.hand else ():
+            if isinstance(action, Carry | Push):
+                yield action.object
+            if isinstance(action, Carry) and action.to.into is not None:
+                yield action.to.into
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe YAML without aliases (they can blow up exponentially) and without silently repeated keys."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.constructor.ConstructorError(
+                None, None, "aliases (*name) are not allowed here", self.peek_event().start_mark
+            )
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        if len(set(keys)) < len(keys):
+            twice = next(key for key in keys if keys.count(key) > 1)
+            raise yaml.constructor.ConstructorError(None, None, f"key '{twice}' occurs twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def scene_names() -> dict[str, Path]:
+    """Name -> folder of every scene that can be found; a name found twice belongs to the earlier folder."""
+    found: dict[str, Path] = {}
+    for folder in scene_roots():
+        for file in sorted(folder.glob(f"*/{FILE_NAME}")):
+            found.setdefault(file.parent.name, file.parent)
+    return found
+
+
+def load_scene(name_or_path: str | Path) -> SceneFile:
+    """Read a scene by name, or by the path of its folder or YAML file.
+
+    Raises `UnknownNameError` with the known scenes, `FileFormatError` with file, field and what is allowed.
+    """
+    path = Path(name_or_path)
+    if path.suffix in (".yaml", ".yml") and path.is_file():
+        return read_scene(path)
+    if len(path.parts) > 1 and (path / FILE_NAME).is_file():
+        return read_scene(path / FILE_NAME)
+    known = scene_names()
+    if str(name_or_path) not in known:
+        raise UnknownNameError("scene", str(name_or_path), known)
+    return read_scene(known[str(name_or_path)] / FILE_NAME)
+
+
+def read_scene(path: Path) -> SceneFile:
+    """Read and validate one scene file; raises `FileFormatError`."""
+    if path.stat().st_size > MAX_BYTES:
+        raise FileFormatError(path, "", f"larger than {MAX_BYTES} bytes, which no scene file is")
+    try:
+        document = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        where = f"line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise FileFormatError(path, where, f"not valid YAML: {error.problem}") from error
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise FileFormatError(path, "", f"not valid YAML: {error}") from error
+    return parse_scene(document, path)
+
+
+def parse_scene(document: Any, path: Path) -> SceneFile:
+    """Validate a scene given as plain data, as if read from `path`; raises `FileFormatError`."""
+    if not isinstance(document, dict):
+        raise FileFormatError(path, "", "a scene is a mapping with at least the fields name, static, robot")
+    try:
+        scene = SceneFile.model_validate(document)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = ".".join(str(part) for part in first["loc"])
+        given = "" if isinstance(first["input"], dict) else f" (given: {first['input']!r:.80})"
+        raise FileFormatError(path, field, f"{first['msg']}{given}") from error
+    scene._path = path.resolve()
+    _check_inside(scene)
+    return scene
+
+
+def _check_inside(scene: SceneFile) -> None:
+    """Refuse a user file that is missing or lies outside of the scene's folder (symbolic links resolved)."""
+    if scene.mjcf is None:
+        return
+    folder = scene.path.parent
+    target = (folder / scene.mjcf).resolve()
+    if not target.is_relative_to(folder):
+        raise FileFormatError(scene.path, "mjcf", f"'{scene.mjcf}' leads out of the scene's folder {folder}")
+    if not target.is_file():
+        raise FileFormatError(scene.path, "mjcf", f"there is no file '{scene.mjcf}' in {folder}")
