@@ -17,7 +17,7 @@ from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import apply, exp_so3, inverse, quaternion_from_rotation
 
 if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
 
 class AxisLike(Protocol):
@@ -53,17 +53,15 @@ def add(T_est: Float64, T_true: Float64, points: Float64) -> float:
     return float(np.linalg.norm(apply(T_est, points) - apply(T_true, points), axis=1).mean())
 
 
-def add_s(T_est: Float64, T_true: Float64, points: Float64, tree: "cKDTree | None" = None) -> float:
+def add_s(T_est: Float64, T_true: Float64, points: Float64, tree: "KDTree | None" = None) -> float:
     """Mean distance of true (N, 3) model points to the nearest estimated one (ADD-S, also called ADI).
 
     `tree` is a KD-tree of model points in the object frame, built once by the caller; distances do not change under the
     rigid motion into the estimate's frame, so that no tree is built for every pose.
     """
-    if tree is None:
-        from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-        tree = cKDTree(points)
-    distances, _ = tree.query(apply(inverse(T_est) @ T_true, points))
+    distances, _ = (tree or KDTree(points)).query(apply(inverse(T_est) @ T_true, points))
     return float(np.mean(distances))
 
 
@@ -74,9 +72,7 @@ def mssd(T_est: Float64, T_true: Float64, points: Float64, equivalents: Float64)
     return float(min(errors))
 
 
-def mspd(
-    T_est: Float64, T_true: Float64, points: Float64, equivalents: Float64, intrinsics: CameraIntrinsics
-) -> float:
+def mspd(T_est: Float64, T_true: Float64, points: Float64, equivalents: Float64, intrinsics: CameraIntrinsics) -> float:
     """Maximum symmetry-aware projection distance, pixels; poses are T_camera_object."""
     estimated = _project(apply(T_est, points), intrinsics)
     errors = [
@@ -91,7 +87,7 @@ def translation_error(T_est: Float64, T_true: Float64) -> float:
 
 
 def rotation_error(T_est: Float64, T_true: Float64, symmetries: SymmetriesLike | None = None) -> float:
-    """Angle between two orientations, radians; the smallest over the object's symmetries (exact for continuous ones)."""
+    """Angle between two orientations, radians; the smallest over the object's symmetries, continuous ones exact."""
     if symmetries is not None:
         T_true = closest_equivalent(T_est, T_true, symmetries)
     wxyz = quaternion_from_rotation(T_est[:3, :3].T @ T_true[:3, :3])
@@ -101,9 +97,9 @@ def rotation_error(T_est: Float64, T_true: Float64, symmetries: SymmetriesLike |
 def closest_equivalent(T_est: Float64, T_true: Float64, symmetries: SymmetriesLike) -> Float64:
     """(4, 4): the pose that cannot be told from `T_true` and whose orientation is closest to `T_est`.
 
-    About a continuous axis the best angle is found in closed form: with the remaining rotation as a quaternion (w, v), a
-    turn of theta about the axis a leaves ``cos(half the angle) = w cos(theta/2) - (v . a) sin(theta/2)``, which is
-    largest at ``theta = 2 atan2(-(v . a), w)``. An object with two axes that are not parallel is a sphere.
+    About a continuous axis the best angle is found in closed form: with the remaining rotation as a quaternion (w,
+    v), a turn of theta about the axis a leaves ``cos(half the angle) = w cos(theta/2) - (v . a) sin(theta/2)``, which
+    is largest at ``theta = 2 atan2(-(v . a), w)``. An object with two axes that are not parallel is a sphere.
     """
     axes = symmetries.axes
     if len(axes) > 1:
@@ -172,10 +168,10 @@ class PoseScorer:
         return np.ascontiguousarray(self.points[::stride], dtype=float)
 
     @cached_property
-    def _tree(self) -> "cKDTree":
-        from scipy.spatial import cKDTree
+    def _tree(self) -> "KDTree":
+        from scipy.spatial import KDTree
 
-        return cKDTree(self.points)
+        return KDTree(self.points)
 
     def add(self, T_est: Float64, T_true: Float64) -> float:
         """ADD, or ADD-S for symmetric objects."""
