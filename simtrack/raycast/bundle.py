@@ -80,7 +80,7 @@ class RayBundle:
     def from_windows(
         intrinsics: CameraIntrinsics, windows: Sequence[tuple[int, int, int, int]], strides: Sequence[int] | int = 1
     ) -> "RayBundle":
-        """Rays of the union of several windows (see `from_camera`), each with its stride, every pixel once, row-major."""
+        """Rays of the union of windows (see `from_camera`), each with its stride; every pixel once, row-major."""
         steps = [strides] * len(windows) if isinstance(strides, int) else list(strides)
         if len(steps) != len(windows) or min(steps, default=1) < 1:
             raise InvalidValueError("strides", strides, f"one number >= 1, or {len(windows)} of them")
@@ -96,7 +96,7 @@ class RayBundle:
 
         Args:
             directions: (N, 3), sensor frame; distances are measured in multiples of their length.
-            groups: (N,) integers, e.g. a lidar's rings: packets hold rays of one group, in the caller's order inside it.
+            groups: (N,) integers, e.g. a lidar's rings: packets hold rays of one group, in order.
 
         Raises:
             InvalidValueError: wrong shape, or a direction that is not finite.
@@ -130,7 +130,9 @@ def _clip(window: tuple[int, int, int, int] | None, intrinsics: CameraIntrinsics
 @lru_cache(maxsize=8)
 def _camera_tables(intrinsics: CameraIntrinsics, stride: int) -> tuple[npt.NDArray[np.int64], ...]:
     """Morton code of each column and each row on the grid of `stride`: a pixel's code is their sum."""
-    return tuple(_spread_bits(np.arange(n) // stride) << shift for n, shift in ((intrinsics.width, 0), (intrinsics.height, 1)))
+    return tuple(
+        _spread_bits(np.arange(n) // stride) << shift for n, shift in ((intrinsics.width, 0), (intrinsics.height, 1))
+    )
 
 
 def _spread_bits(value: np.ndarray) -> npt.NDArray[np.int64]:
@@ -149,7 +151,7 @@ def _from_pixels(intrinsics: CameraIntrinsics, pixels: Int32, stride: int, shape
 
 
 @nb.njit(cache=True, nogil=True)
-def _pack_pixels(pixels, image_width, columns, rows, fx, fy, cx, cy, width):  # noqa: ANN001, ANN202
+def _pack_pixels(pixels, image_width, columns, rows, fx, fy, cx, cy, width):
     """Directions (N, 3), packet order (P,) along the Morton curve, and directions in that order (P / width, 3, width).
 
     Eight consecutive pixels of a filled image along the curve are a 4x2 tile, sixteen a 4x4 tile; sparse and strided

@@ -36,7 +36,9 @@ def cast(
         rays = np.flatnonzero(usable)
         T = T_map_mesh if T_map_mesh.ndim == 2 else T_map_mesh[rays]
         T_mesh_map = np.linalg.inv(T)
-        local_directions = np.einsum("...ij,nj->ni" if T.ndim == 2 else "nij,nj->ni", T_mesh_map[..., :3, :3], directions[rays])
+        local_directions = np.einsum(
+            "...ij,nj->ni" if T.ndim == 2 else "nij,nj->ni", T_mesh_map[..., :3, :3], directions[rays]
+        )
         shifted = origins[rays] - T[..., :3, 3]
         local_origins = np.einsum("...ij,nj->ni" if T.ndim == 2 else "nij,nj->ni", T_mesh_map[..., :3, :3], shifted)
         _keep_nearest(entry, number, rays, local_origins, local_directions, T_mesh_map, (near, far), hits)
@@ -59,9 +61,7 @@ def _keep_nearest(
     if not reach.any():
         return
     origins = origins[reach] + float(limits[0]) * directions[reach]
-    output = entry.mesh.embreex_scene.run(
-        origins.astype(np.float32), directions[reach].astype(np.float32), output=True
-    )
+    output = entry.mesh.embreex_scene.run(origins.astype(np.float32), directions[reach].astype(np.float32), output=True)
     distances = output["tfar"] + limits[0]
     better = (output["primID"] >= 0) & (distances < hits.distances[rays[reach]]) & (distances <= limits[1])
     chosen = rays[reach][better]
@@ -69,7 +69,9 @@ def _keep_nearest(
     hits.faces[chosen] = output["primID"][better]
     hits.instances[chosen] = number
     inverse = T_mesh_map[..., :3, :3] if T_mesh_map.ndim == 2 else T_mesh_map[reach][better][:, :3, :3]
-    normals = np.einsum("ji,nj->ni" if inverse.ndim == 2 else "nji,nj->ni", inverse, output["Ng"][better].astype(np.float64))
+    normals = np.einsum(
+        "ji,nj->ni" if inverse.ndim == 2 else "nji,nj->ni", inverse, output["Ng"][better].astype(np.float64)
+    )
     hits.normals[chosen] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 

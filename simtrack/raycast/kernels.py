@@ -5,8 +5,6 @@ mask 9, id 10, flags 11 | normal xyz 12-14, u 15, v 16, primitive 17, geometry 1
 Every output element is written from one packet only, so the results do not depend on the number of threads.
 """
 
-from collections.abc import Callable
-from functools import lru_cache
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -19,6 +17,13 @@ _CHUNK = 64
 _COHERENT = np.uint32(1 << 16)
 """RTC_RAY_QUERY_FLAG_COHERENT."""
 _POOL_LOCK = Lock()
+
+# numba does not cache kernels that hold an address; a symbol's name is cached, and `embree.embree` registers it.
+_QUERY = types.void(types.intp, types.intp, types.intp, types.intp)
+_rtcIntersect8 = types.ExternalFunction("rtcIntersect8", _QUERY)
+_rtcIntersect16 = types.ExternalFunction("rtcIntersect16", _QUERY)
+_rtcOccluded8 = types.ExternalFunction("rtcOccluded8", _QUERY)
+_rtcOccluded16 = types.ExternalFunction("rtcOccluded16", _QUERY)
 
 
 class InstanceTable(NamedTuple):
@@ -34,26 +39,53 @@ class InstanceTable(NamedTuple):
     """(K, 3, 3) float32, linear parts of the motion keys."""
 
 
-class PacketKernels(NamedTuple):
-    """The two queries of one packet width."""
+class Bundle(NamedTuple):
+    """Rays from one origin; the fields are arguments of `cast`."""
 
-    cast_bundle: Callable[..., None]
-    cast_rays: Callable[..., None]
-    occluded: Callable[..., None]
+    packed: np.ndarray
+    """(B, 3, W) float32, sensor frame."""
+    order: np.ndarray
+    """(B * W,) int32."""
+    rotation: np.ndarray
+    """(3, 3) float32, map from sensor."""
+    origin: np.ndarray
+    """(3,) float32, map frame."""
+    time: np.float32
 
 
-def run(width: int, query: str, *arguments: Any) -> None:
-    """Call one query with `numba.get_num_threads()` threads; numba's own pool is entered by one thread at a time."""
+class Rays(NamedTuple):
+    """Rays of their own origin and time, map frame."""
+
+    origins: np.ndarray
+    """(N, 3) float32."""
+    directions: np.ndarray
+    """(N, 3) float32."""
+    times: np.ndarray
+    """(N,) float32, or empty for time 0."""
+    order: np.ndarray
+    """(B * W,) int32."""
+
+
+class Output(NamedTuple):
+    """The arrays of `RayHits`."""
+
+    distances: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    instances: np.ndarray
+
+
+def run(serial: Any, parallel: Any, *arguments: Any) -> None:
+    """Call a kernel with `numba.get_num_threads()` threads; numba's own pool is entered by one thread at a time."""
     if nb.get_num_threads() == 1:
-        getattr(packet_kernels(width, parallel=False), query)(*arguments)
+        serial(*arguments)
         return
-    kernel = getattr(packet_kernels(width, parallel=True), query)
     with _POOL_LOCK:
-        kernel(*arguments)
+        parallel(*arguments)
 
 
 @nb.njit(cache=True, nogil=True)
-def _normal_matrix(linear):  # noqa: ANN001, ANN202
+def _normal_matrix(linear):
     """Cofactor matrix of a (3, 3) with the sign of the determinant: the inverse transpose up to a positive scale."""
     out = np.empty((3, 3), np.float32)
     for i in range(3):
@@ -66,7 +98,7 @@ def _normal_matrix(linear):  # noqa: ANN001, ANN202
 
 
 @nb.njit(cache=True, nogil=True)
-def _moving_normal_matrix(table, instance, time):  # noqa: ANN001, ANN202
+def _moving_normal_matrix(table, instance, time):
     """Normal matrix between two motion keys, which Embree interpolates linearly."""
     segments = table.key_count[instance] - 1
     position = min(max(time, np.float32(0.0)), np.float32(1.0)) * segments
@@ -76,149 +108,175 @@ def _moving_normal_matrix(table, instance, time):  # noqa: ANN001, ANN202
     return _normal_matrix((np.float32(1) - fraction) * table.keys[row] + fraction * table.keys[row + 1])
 
 
-@lru_cache(maxsize=4)
-def packet_kernels(width: int, parallel: bool) -> PacketKernels:
-    """Kernels for packets of `width` rays (8 or 16). The symbols must have been registered: see `embree.embree`."""
-    intersect = types.ExternalFunction(f"rtcIntersect{width}", types.void(*[types.intp] * 4))
-    occlude = types.ExternalFunction(f"rtcOccluded{width}", types.void(*[types.intp] * 4))
-    lanes = width
-    words = 21 * width
-    spare = 16  # words, to start the packet at a multiple of 64 bytes
+@nb.njit(cache=True, nogil=True)
+def _aligned(words):
+    """At least `words` zeroed float32 from a multiple of 64 bytes on."""
+    raw = np.zeros(words + 16, np.float32)
+    return raw[(-raw.ctypes.data % 64) // 4 :]
 
-    @nb.njit(cache=True, nogil=True)
-    def aligned(count):  # noqa: ANN001, ANN202
-        raw = np.zeros(count + spare, np.float32)
-        return raw[(-raw.ctypes.data % 64) // 4 :]
 
-    @nb.njit(cache=True, nogil=True)
-    def arguments(coherent):  # noqa: ANN001, ANN202
-        """RTCIntersectArguments and RTCOccludedArguments: flags, feature mask, three null pointers."""
-        query = np.zeros(16, np.uint32)
-        query[0] = _COHERENT if coherent else np.uint32(0)
-        query[1] = np.uint32(0xFFFFFFFF)
-        return query
+@nb.njit(cache=True, nogil=True)
+def _new_packet(lanes, near, time, coherent):
+    """Packet with its constant fields set, lane mask, and query arguments (flags, feature mask, null pointers).
 
-    @nb.njit(cache=True, nogil=True)
-    def new_packet(tnear, time):  # noqa: ANN001, ANN202
-        packet = aligned(words)
-        integers = packet.view(np.int32)
-        for k in range(lanes):
-            packet[3 * lanes + k] = tnear
-            packet[7 * lanes + k] = time
-            integers[9 * lanes + k] = -1
-            integers[10 * lanes + k] = k
-        return packet, integers
+    `lanes` is a tuple as long as the packet is wide: the type fixes its length, so that loops over lanes unroll.
+    """
+    packet = _aligned(21 * len(lanes))
+    integers = packet.view(np.int32)
+    for k in range(len(lanes)):
+        packet[3 * len(lanes) + k] = near
+        packet[7 * len(lanes) + k] = time
+        integers[9 * len(lanes) + k] = -1
+        integers[10 * len(lanes) + k] = k
+    valid = _aligned(len(lanes)).view(np.int32)
+    valid[: len(lanes)] = -1
+    query = np.zeros(16, np.uint32)
+    query[0] = _COHERENT if coherent else np.uint32(0)
+    query[1] = np.uint32(0xFFFFFFFF)
+    return packet, integers, valid, query
 
-    @nb.njit(cache=True, nogil=True)
-    def all_lanes():  # noqa: ANN202
-        valid = aligned(lanes).view(np.int32)
-        valid[:lanes] = -1
-        return valid
 
-    @nb.njit(cache=True, nogil=True)
-    def read(packet, integers, order, base, table, distances, normals, faces, instances):  # noqa: ANN001, ANN202
-        """Copy the hits of one packet to the outputs, normals turned into the map frame."""
-        for k in range(lanes):
-            ray = order[base + k]
-            instance = integers[19 * lanes + k]
-            if instance < 0:
-                distances[ray] = np.inf
-                faces[ray] = -1
-                instances[ray] = -1
-                normals[ray, 0] = 0.0
-                normals[ray, 1] = 0.0
-                normals[ray, 2] = 0.0
-                continue
-            distances[ray] = packet[8 * lanes + k]
-            faces[ray] = integers[17 * lanes + k]
-            instances[ray] = instance
-            m = table.normal[instance]
-            if table.key_count[instance] > 1:
-                m = _moving_normal_matrix(table, instance, packet[7 * lanes + k])
-            a, b, c = packet[12 * lanes + k], packet[13 * lanes + k], packet[14 * lanes + k]
-            x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c
-            y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c
-            z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
-            scale = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
-            normals[ray, 0] = x * scale
-            normals[ray, 1] = y * scale
-            normals[ray, 2] = z * scale
+@nb.njit(cache=True, nogil=True)
+def _intersect(lanes, valid, scene, packet, query):
+    if len(lanes) == 16:
+        _rtcIntersect16(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
+    else:
+        _rtcIntersect8(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
 
-    @nb.njit(cache=True, nogil=True, parallel=parallel)
-    def cast_bundle(  # noqa: ANN202
-        scene, packed, order, rotation, origin, near, far, time, table, distances, normals, faces, instances  # noqa: ANN001
-    ):
-        blocks = packed.shape[0]
-        chunks = (blocks + _CHUNK - 1) // _CHUNK
-        for c in nb.prange(chunks):
-            packet, integers = new_packet(near, time)
-            valid, query = all_lanes(), arguments(True)
-            for k in range(lanes):
-                packet[k], packet[lanes + k], packet[2 * lanes + k] = origin[0], origin[1], origin[2]
-            for block in range(c * _CHUNK, min((c + 1) * _CHUNK, blocks)):
-                for axis in range(3):
-                    r0, r1, r2 = rotation[axis, 0], rotation[axis, 1], rotation[axis, 2]
-                    for k in range(lanes):
-                        packet[(4 + axis) * lanes + k] = (
-                            r0 * packed[block, 0, k] + r1 * packed[block, 1, k] + r2 * packed[block, 2, k]
-                        )
-                for k in range(lanes):
-                    packet[8 * lanes + k] = far
-                    integers[18 * lanes + k] = -1
-                    integers[19 * lanes + k] = -1
-                intersect(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
-                read(packet, integers, order, block * lanes, table, distances, normals, faces, instances)
 
-    @nb.njit(cache=True, nogil=True)
-    def load(packet, integers, valid, order, base, origins, directions, times, far):  # noqa: ANN001, ANN202
-        """Fill one packet with rays of their own origin and time; a ray that is not finite or has no direction is off."""
-        for k in range(lanes):
-            ray = order[base + k]
-            checksum = np.float32(0.0)
-            length = np.float32(0.0)
-            for axis in range(3):
-                packet[axis * lanes + k] = origins[ray, axis]
-                packet[(4 + axis) * lanes + k] = directions[ray, axis]
-                checksum += np.float32(0.0) * (origins[ray, axis] + directions[ray, axis])
-                length += abs(directions[ray, axis])
-            if times.shape[0] > 0:
-                packet[7 * lanes + k] = times[ray]
-                checksum += np.float32(0.0) * times[ray]
-            packet[8 * lanes + k] = far
-            integers[18 * lanes + k] = -1
-            integers[19 * lanes + k] = -1
-            valid[k] = -1 if checksum == 0.0 and length > 0.0 else 0
+@nb.njit(cache=True, nogil=True)
+def _occlude(lanes, valid, scene, packet, query):
+    if len(lanes) == 16:
+        _rtcOccluded16(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
+    else:
+        _rtcOccluded8(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
 
-    @nb.njit(cache=True, nogil=True, parallel=parallel)
-    def cast_rays(  # noqa: ANN202
-        scene, origins, directions, times, order, near, far, coherent, table, distances, normals, faces, instances  # noqa: ANN001
-    ):
-        blocks = order.shape[0] // lanes
-        chunks = (blocks + _CHUNK - 1) // _CHUNK
-        for c in nb.prange(chunks):
-            packet, integers = new_packet(near, np.float32(0.0))
-            valid, query = all_lanes(), arguments(coherent)
-            for block in range(c * _CHUNK, min((c + 1) * _CHUNK, blocks)):
-                load(packet, integers, valid, order, block * lanes, origins, directions, times, far)
-                intersect(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
-                read(packet, integers, order, block * lanes, table, distances, normals, faces, instances)
 
-    @nb.njit(cache=True, nogil=True, parallel=parallel)
-    def occluded(scene, origins, directions, times, order, near, distances, blocked):  # noqa: ANN001, ANN202
-        blocks = order.shape[0] // lanes
-        chunks = (blocks + _CHUNK - 1) // _CHUNK
-        for c in nb.prange(chunks):
-            packet, integers = new_packet(near, np.float32(0.0))
-            valid, query = all_lanes(), arguments(False)
-            for block in range(c * _CHUNK, min((c + 1) * _CHUNK, blocks)):
-                load(packet, integers, valid, order, block * lanes, origins, directions, times, np.float32(0.0))
-                for k in range(lanes):
-                    far = distances[order[block * lanes + k]]
-                    packet[8 * lanes + k] = far
-                    if not far > near:
-                        valid[k] = 0
-                occlude(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
-                for k in range(lanes):
-                    blocked[order[block * lanes + k]] = valid[k] != 0 and packet[8 * lanes + k] < 0.0
+@nb.njit(cache=True, nogil=True)
+def _read(lanes, packet, integers, order, base, table, out):
+    """Copy the hits of one packet to the outputs, normals turned into the map frame."""
+    for k in range(len(lanes)):
+        ray = order[base + k]
+        instance = integers[19 * len(lanes) + k]
+        if instance < 0:
+            out.distances[ray] = np.inf
+            out.faces[ray] = -1
+            out.instances[ray] = -1
+            out.normals[ray, 0] = 0.0
+            out.normals[ray, 1] = 0.0
+            out.normals[ray, 2] = 0.0
+            continue
+        out.distances[ray] = packet[8 * len(lanes) + k]
+        out.faces[ray] = integers[17 * len(lanes) + k]
+        out.instances[ray] = instance
+        m = table.normal[instance]
+        if table.key_count[instance] > 1:
+            m = _moving_normal_matrix(table, instance, packet[7 * len(lanes) + k])
+        a, b, c = packet[12 * len(lanes) + k], packet[13 * len(lanes) + k], packet[14 * len(lanes) + k]
+        x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c
+        y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c
+        z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
+        scale = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
+        out.normals[ray, 0] = x * scale
+        out.normals[ray, 1] = y * scale
+        out.normals[ray, 2] = z * scale
 
-    return PacketKernels(cast_bundle, cast_rays, occluded)
+
+@nb.njit(cache=True, nogil=True)
+def _bundle_chunk(chunk, lanes, scene, bundle, near, far, table, out):
+    packet, integers, valid, query = _new_packet(lanes, near, bundle.time, True)
+    for axis in range(3):
+        for k in range(len(lanes)):
+            packet[axis * len(lanes) + k] = bundle.origin[axis]
+    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, bundle.packed.shape[0])):
+        for axis in range(3):
+            r0, r1, r2 = bundle.rotation[axis, 0], bundle.rotation[axis, 1], bundle.rotation[axis, 2]
+            for k in range(len(lanes)):
+                x, y, z = bundle.packed[block, 0, k], bundle.packed[block, 1, k], bundle.packed[block, 2, k]
+                packet[(4 + axis) * len(lanes) + k] = r0 * x + r1 * y + r2 * z
+        for k in range(len(lanes)):
+            packet[8 * len(lanes) + k] = far
+            integers[18 * len(lanes) + k] = -1
+            integers[19 * len(lanes) + k] = -1
+        _intersect(lanes, valid, scene, packet, query)
+        _read(lanes, packet, integers, bundle.order, block * len(lanes), table, out)
+
+
+@nb.njit(cache=True, nogil=True)
+def _load(lanes, packet, integers, valid, rays, base, far):
+    """Fill one packet with rays of their own origin and time; a ray that is not finite or has no direction is off."""
+    for k in range(len(lanes)):
+        ray = rays.order[base + k]
+        poison = np.float32(0.0)
+        length = np.float32(0.0)
+        for axis in range(3):
+            packet[axis * len(lanes) + k] = rays.origins[ray, axis]
+            packet[(4 + axis) * len(lanes) + k] = rays.directions[ray, axis]
+            poison += np.float32(0.0) * (rays.origins[ray, axis] + rays.directions[ray, axis])
+            length += abs(rays.directions[ray, axis])
+        if rays.times.shape[0] > 0:
+            packet[7 * len(lanes) + k] = rays.times[ray]
+            poison += np.float32(0.0) * rays.times[ray]
+        packet[8 * len(lanes) + k] = far
+        integers[18 * len(lanes) + k] = -1
+        integers[19 * len(lanes) + k] = -1
+        valid[k] = -1 if poison == 0.0 and length > 0.0 else 0
+
+
+@nb.njit(cache=True, nogil=True)
+def _rays_chunk(chunk, lanes, scene, rays, near, far, coherent, table, out):
+    packet, integers, valid, query = _new_packet(lanes, near, np.float32(0.0), coherent)
+    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, rays.order.shape[0] // len(lanes))):
+        _load(lanes, packet, integers, valid, rays, block * len(lanes), far)
+        _intersect(lanes, valid, scene, packet, query)
+        _read(lanes, packet, integers, rays.order, block * len(lanes), table, out)
+
+
+@nb.njit(cache=True, nogil=True)
+def _occluded_chunk(chunk, lanes, scene, rays, near, distances, blocked):
+    packet, integers, valid, query = _new_packet(lanes, near, np.float32(0.0), False)
+    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, rays.order.shape[0] // len(lanes))):
+        base = block * len(lanes)
+        _load(lanes, packet, integers, valid, rays, base, np.float32(0.0))
+        for k in range(len(lanes)):
+            packet[8 * len(lanes) + k] = distances[rays.order[base + k]]
+            if not distances[rays.order[base + k]] > near:
+                valid[k] = 0
+        _occlude(lanes, valid, scene, packet, query)
+        for k in range(len(lanes)):
+            blocked[rays.order[base + k]] = valid[k] != 0 and packet[8 * len(lanes) + k] < 0.0
+
+
+@nb.njit(cache=True, nogil=True)
+def cast_bundle(lanes, scene, bundle, near, far, table, out):
+    """Nearest hits of a bundle, on the calling thread."""
+    for chunk in range((bundle.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
+        _bundle_chunk(chunk, lanes, scene, bundle, near, far, table, out)
+
+
+@nb.njit(cache=True, nogil=True, parallel=True)
+def cast_bundle_parallel(lanes, scene, bundle, near, far, table, out):
+    """`cast_bundle` on numba's threads."""
+    for chunk in nb.prange((bundle.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
+        _bundle_chunk(chunk, lanes, scene, bundle, near, far, table, out)
+
+
+@nb.njit(cache=True, nogil=True)
+def cast_rays(lanes, scene, rays, near, far, coherent, table, out):
+    """Nearest hits of single rays, on the calling thread."""
+    for chunk in range((rays.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
+        _rays_chunk(chunk, lanes, scene, rays, near, far, coherent, table, out)
+
+
+@nb.njit(cache=True, nogil=True, parallel=True)
+def cast_rays_parallel(lanes, scene, rays, near, far, coherent, table, out):
+    """`cast_rays` on numba's threads."""
+    for chunk in nb.prange((rays.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
+        _rays_chunk(chunk, lanes, scene, rays, near, far, coherent, table, out)
+
+
+@nb.njit(cache=True, nogil=True)
+def occluded(lanes, scene, rays, near, distances, blocked):
+    """Whether anything is nearer than `distances`, on the calling thread."""
+    for chunk in range((rays.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
+        _occluded_chunk(chunk, lanes, scene, rays, near, distances, blocked)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from simtrack.contracts import Bool, Float32, Float64, Int32
 from simtrack.errors import InvalidValueError, RaycastError
 from simtrack.raycast import embree as rtc
+from simtrack.raycast import fallback, kernels
 from simtrack.raycast.bundle import RayBundle
 from simtrack.raycast.mesh import TriangleMesh
 
@@ -85,17 +86,17 @@ class RayScene:
     among themselves). The threads used are ``numba.get_num_threads()``; results do not depend on their number.
     """
 
-    def __init__(self, fallback: bool | None = None) -> None:
+    def __init__(self, use_fallback: bool | None = None) -> None:
         """Create an empty scene.
 
         Args:
-            fallback: True casts with `embreex`'s single rays (same results, an order of magnitude slower); None does
+            use_fallback: True casts with `embreex`'s single rays (same results, slower); None does
                 so where the library cannot be reached or the environment sets ``SIMTRACK_RAYCAST=fallback``.
 
         Raises:
-            RaycastError: `fallback` is False and the library cannot be used.
+            RaycastError: `use_fallback` is False and the library cannot be used.
         """
-        self.fallback = (rtc.fallback_forced() or not rtc.available()) if fallback is None else fallback
+        self.fallback = (rtc.fallback_forced() or not rtc.available()) if use_fallback is None else use_fallback
         self._instances: dict[int, Instance] = {}
         self._lock = RLock()
         self._dirty = True
@@ -141,7 +142,9 @@ class RayScene:
         keys = _checked_transforms(np.eye(4) if T_map_mesh is None else T_map_mesh, "T_map_mesh")
         with self._lock:
             self._open()
-            number = next(i for i in range(MAX_INSTANCE + 1) if i not in self._instances) if instance is None else instance
+            number = (
+                next(i for i in range(MAX_INSTANCE + 1) if i not in self._instances) if instance is None else instance
+            )
             if number in self._instances or not 0 <= number < MAX_INSTANCE:
                 raise InvalidValueError("instance", number, f"0..{MAX_INSTANCE - 1} and not one of {self.instances}")
             entry = Instance(mesh, keys)
@@ -235,16 +238,15 @@ class RayScene:
         rotation, origin = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
         limits = np.float32(min_distance), np.float32(max_distance)
         if self.fallback:
-            from simtrack.raycast import fallback
-
             rays = bundle.directions @ rotation.T
             times = np.full(len(bundle), time)
             fallback.cast(self._instances, np.broadcast_to(origin, rays.shape), rays, times, *limits, hits)
         elif len(bundle):
-            self._run(
-                "cast_bundle", bundle.packed, bundle.order, rotation, origin, *limits, np.float32(time),
-                self._table, hits.distances, hits.normals, hits.faces, hits.instances,
-            )  # fmt: skip
+            rays = kernels.Bundle(bundle.packed, bundle.order, rotation, origin, np.float32(time))
+            lanes = (0,) * bundle.packed.shape[2]
+            output = kernels.Output(hits.distances, hits.normals, hits.faces, hits.instances)
+            arguments = (lanes, self._top, rays, *limits, self._table, output)
+            kernels.run(kernels.cast_bundle, kernels.cast_bundle_parallel, *arguments)
         return hits
 
     def cast_rays(
@@ -275,14 +277,12 @@ class RayScene:
         hits = _outputs(out, len(rays[0]))
         limits = np.float32(min_distance), np.float32(max_distance)
         if self.fallback:
-            from simtrack.raycast import fallback
-
             fallback.cast(self._instances, *rays[:3], *limits, hits)
         elif len(rays[0]):
-            self._run(
-                "cast_rays", *rays, *limits, packing is not None,
-                self._table, hits.distances, hits.normals, hits.faces, hits.instances,
-            )  # fmt: skip
+            lanes = (0,) * rtc.embree().packet_width
+            output = kernels.Output(hits.distances, hits.normals, hits.faces, hits.instances)
+            arguments = (lanes, self._top, kernels.Rays(*rays), *limits, packing is not None, self._table, output)
+            kernels.run(kernels.cast_rays, kernels.cast_rays_parallel, *arguments)
         return hits
 
     def occluded(
@@ -299,14 +299,13 @@ class RayScene:
         limit = np.ascontiguousarray(np.broadcast_to(np.asarray(distances, np.float32), (len(rays[0]),)))
         self.commit()
         if self.fallback:
-            from simtrack.raycast import fallback
-
             hits = RayHits.empty(len(limit))
             fallback.cast(self._instances, *rays[:3], np.float32(min_distance), np.float32(np.inf), hits)
             return hits.distances < limit
         blocked = np.zeros(len(limit), np.bool_)
         if len(limit):
-            self._run("occluded", *rays, np.float32(min_distance), limit, blocked)
+            lanes = (0,) * rtc.embree().packet_width
+            kernels.occluded(lanes, self._top, kernels.Rays(*rays), np.float32(min_distance), limit, blocked)
         return blocked
 
     # -------------------------------------------------------------------------------------------------- life and end
@@ -358,8 +357,6 @@ class RayScene:
             self._dirty = True
 
     def _instance_table(self) -> object:
-        from simtrack.raycast.kernels import InstanceTable
-
         size = max(self._instances, default=-1) + 1
         normal = np.zeros((size, 3, 3), np.float32)
         start, count = np.zeros(size, np.int32), np.ones(size, np.int32)
@@ -373,13 +370,7 @@ class RayScene:
                 start[number], count[number] = rows, len(linear)
                 keys.append(linear)
                 rows += len(linear)
-        return InstanceTable(normal, start, count, np.concatenate(keys).astype(np.float32))
-
-    def _run(self, query: str, *arguments: object) -> None:
-        from simtrack.raycast import kernels
-
-        width = rtc.embree().packet_width
-        kernels.run(width, query, self._top, *arguments)
+        return kernels.InstanceTable(normal, start, count, np.concatenate(keys).astype(np.float32))
 
 
 def _write_keys(entry: Instance) -> None:
