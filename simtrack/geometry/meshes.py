@@ -341,15 +341,13 @@ def decimate(mesh: Mesh, target_faces: int) -> Mesh:
         return mesh
     import fast_simplification
 
-    points, faces = fast_simplification.simplify(
-        mesh.vertices.astype(np.float32), mesh.faces, target_count=max(int(target_faces), 4)
-    )[:2]
-    out = Mesh(points, faces)
+    points, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=max(int(target_faces), 4))[:2]
+    out = Mesh(points, faces.astype(np.int32))
     if mesh.face_colors is None:
         return out
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    nearest = cKDTree(mesh.triangles.mean(axis=1)).query(out.triangles.mean(axis=1))[1]
+    nearest = KDTree(mesh.triangles.mean(axis=1)).query(out.triangles.mean(axis=1))[1]
     return Mesh(out.vertices, out.faces, mesh.face_colors[nearest])
 
 
@@ -369,6 +367,7 @@ def load_mesh(path: str | Path) -> Mesh:
     if path.stat().st_size > MAX_FILE_BYTES:
         raise MeshError(path, f"is larger than {MAX_FILE_BYTES} bytes")
     import trimesh
+    from trimesh.visual.color import ColorVisuals
 
     try:
         loaded = trimesh.load_mesh(BytesIO(path.read_bytes()), file_type=path.suffix.lower()[1:], resolver=None)
@@ -380,5 +379,8 @@ def load_mesh(path: str | Path) -> Mesh:
         raise MeshError(path, "holds no triangles")
     if len(loaded.faces) > MAX_FACES:
         raise MeshError(path, f"has {len(loaded.faces)} faces; at most {MAX_FACES} are allowed")
-    colors = np.asarray(loaded.visual.face_colors)[:, :3] if loaded.visual.kind in ("face", "vertex") else None
+    visual = loaded.visual
+    colors = None
+    if isinstance(visual, ColorVisuals) and visual.kind in ("face", "vertex"):
+        colors = np.asarray(visual.face_colors)[:, :3]
     return validate(Mesh(np.asarray(loaded.vertices), np.asarray(loaded.faces, np.int32), colors), path)
