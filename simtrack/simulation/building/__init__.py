@@ -1,0 +1,1 @@
+"""Buildings: static worlds of coloured, labelled parts, furnished from a seed."""
