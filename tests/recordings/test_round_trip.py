@@ -87,7 +87,7 @@ def test_what_a_stack_needs_comes_back(record: Record, static_map: StaticMap) ->
     head = Link("head", "base", axis, np.eye(4), *none, 2.5, (0.1, 0.2, 0.3))
     resources = {
         "static_map": static_map,
-        "models": {"relay": load_object("relay")},
+        "models": {"klt3147": load_object("klt3147")},
         "robot": KinematicTree((base, head)),
         "metadata": {"scene": "workbench", "configuration": {"seed": 0, "gain": 0.1 + 0.2, "none": None}},
     }
@@ -95,7 +95,7 @@ def test_what_a_stack_needs_comes_back(record: Record, static_map: StaticMap) ->
     assert recording.complete
     for name, value in resources.items():
         assert same(getattr(recording, name), value), name
-    assert recording.models["relay"].mesh.vertices.flags.writeable
+    assert recording.models["klt3147"].mesh.vertices.flags.writeable
 
 
 def test_a_recording_without_resources_is_only_a_feed(record: Record) -> None:
