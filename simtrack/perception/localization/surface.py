@@ -1,0 +1,63 @@
+"""The static map as the localizer sees it: a ray-cast surface with denoised normals."""
+
+import numpy as np
+
+from simtrack.contracts import Float32, Float64, Int32, StaticMap
+from simtrack.errors import MeshError
+from simtrack.geometry.transforms import apply
+from simtrack.perception.localization.measurement import Measurement
+from simtrack.raycast import RayHits, RayScene, TriangleMesh
+
+
+class MapSurface:
+    """A static map in a ray-cast scene, which may hold other things too."""
+
+    def __init__(self, static_map: StaticMap, scene: RayScene | None = None, instance: int = 0) -> None:
+        """Put the map into a scene of its own, or use one that holds it already.
+
+        Args:
+            static_map: the survey.
+            scene: a scene that holds the map's mesh in the map frame; other instances in it occlude the map, but the
+                pose is never corrected by them.
+            instance: the map's instance id in `scene`.
+
+        Raises:
+            MeshError: the map's mesh is empty or not finite.
+        """
+        if not len(static_map.faces) or not np.isfinite(static_map.vertices).all():
+            raise MeshError("static map", "needs at least one face, and finite vertices")
+        self.static_map = static_map
+        if scene is None:
+            scene = RayScene()
+            scene.add(TriangleMesh(static_map.vertices, static_map.faces, source="static map"), instance=instance)
+        self.scene = scene
+        self.instance = instance
+        self.normals = smoothed_normals(static_map.vertices, static_map.faces)
+        self.patch_variance = 2.0 * static_map.noise**2
+        """m^2, error of one face's plane. A face stands for half a vertex: independent face errors of twice the
+        vertex variance give averages over a surface the variance that independent vertex errors give them."""
+        self.counts = np.zeros(len(static_map.faces), np.int32)
+        self.floor = float(np.median([room.floor for room in static_map.rooms])) if static_map.rooms else 0.0
+        """m, height of the map's floor."""
+
+    def cast(self, T_map_base: Float64, shots: Measurement) -> RayHits:
+        """What each shot would have met from `T_map_base`."""
+        rotation = T_map_base[:3, :3]
+        return self.scene.cast_rays(apply(T_map_base, shots.origins), shots.directions @ rotation.T)
+
+
+def smoothed_normals(vertices: Float32, faces: Int32, rounds: int = 3, crease: float = 0.8) -> Float64:
+    """(F, 3) unit face normals, averaged by area over neighbouring faces that point about the same way.
+
+    A survey's noise tilts every face at random, which would feign information about directions along a wall.
+    Bilateral: faces whose normals differ by more than ``acos(crease)`` are not averaged.
+    """
+    from simtrack.perception.localization.kernels import average_normals
+
+    corners = np.asarray(vertices, dtype=np.float64)[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.sqrt((normals * normals).sum(axis=1))
+    normals /= np.maximum(areas, 1e-15)[:, None]
+    for _ in range(rounds):
+        normals = average_normals(normals, areas, np.asarray(faces, np.int64), len(vertices), crease)
+    return normals
