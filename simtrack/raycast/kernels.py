@@ -152,34 +152,51 @@ def _occlude(lanes, valid, scene, packet, query):
         _rtcOccluded8(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
 
 
-@nb.njit(cache=True, nogil=True)
-def _read(lanes, packet, integers, order, base, table, out):
-    """Copy the hits of one packet to the outputs, normals turned into the map frame."""
-    for k in range(len(lanes)):
-        ray = order[base + k]
-        instance = integers[19 * len(lanes) + k]
-        if instance < 0:
-            out.distances[ray] = np.inf
-            out.faces[ray] = -1
-            out.instances[ray] = -1
-            out.normals[ray, 0] = 0.0
-            out.normals[ray, 1] = 0.0
-            out.normals[ray, 2] = 0.0
-            continue
-        out.distances[ray] = packet[8 * len(lanes) + k]
-        out.faces[ray] = integers[17 * len(lanes) + k]
-        out.instances[ray] = instance
-        m = table.normal[instance]
-        if table.key_count[instance] > 1:
-            m = _moving_normal_matrix(table, instance, packet[7 * len(lanes) + k])
-        a, b, c = packet[12 * len(lanes) + k], packet[13 * len(lanes) + k], packet[14 * len(lanes) + k]
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _turn_normals(lanes, packet, m, first, last):
+    """Normals of some lanes, in place: mesh frame, any length -> map frame, unit."""
+    width = len(lanes)
+    for k in range(first, last):
+        a, b, c = packet[12 * width + k], packet[13 * width + k], packet[14 * width + k]
         x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c
         y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c
         z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
         scale = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
-        out.normals[ray, 0] = x * scale
-        out.normals[ray, 1] = y * scale
-        out.normals[ray, 2] = z * scale
+        packet[12 * width + k] = x * scale
+        packet[13 * width + k] = y * scale
+        packet[14 * width + k] = z * scale
+
+
+@nb.njit(cache=True, nogil=True)
+def _read(lanes, packet, integers, order, base, table, out):
+    """Copy the hits of one packet to the outputs, normals turned into the map frame."""
+    width = len(lanes)
+    instance = integers[19 * width]
+    uniform = instance >= 0
+    for k in range(width):
+        uniform &= integers[19 * width + k] == instance
+    if uniform and table.key_count[instance] == 1:  # nearly always, and then one vector loop does
+        _turn_normals(lanes, packet, table.normal[instance], 0, width)
+    else:
+        for k in range(width):
+            instance = integers[19 * width + k]
+            if instance < 0:
+                packet[8 * width + k] = np.inf
+                integers[17 * width + k] = -1
+                for axis in range(3):
+                    packet[(12 + axis) * width + k] = 0.0
+            elif table.key_count[instance] > 1:
+                turn = _moving_normal_matrix(table, instance, packet[7 * width + k])
+                _turn_normals(lanes, packet, turn, k, k + 1)
+            else:
+                _turn_normals(lanes, packet, table.normal[instance], k, k + 1)
+    for k in range(width):
+        ray = np.uint32(order[base + k])
+        out.distances[ray] = packet[8 * width + k]
+        out.faces[ray] = integers[17 * width + k]
+        out.instances[ray] = integers[19 * width + k]
+        for axis in range(3):
+            out.normals[ray, axis] = packet[(12 + axis) * width + k]
 
 
 @nb.njit(cache=True, nogil=True)
