@@ -1,0 +1,1 @@
+"""Sensor models: what a camera, a lidar, wheels and encoders report, and how they err."""
