@@ -9,9 +9,18 @@ from types import MappingProxyType
 from simtrack.errors import FileFormatError, InvalidValueError, UnknownNameError
 from simtrack.objects.model import ObjectModel
 
-BUILT_IN = ("klt3147", "materialbox")
+BUILT_IN = ("klt3147", "materialbox", "multimeter", "powerdrill", "relay", "screwdriver")
 """Names of the procedural objects that trackers have models of."""
-CLUTTER: tuple[str, ...] = ()
+CLUTTER = (
+    "cardboard_box",
+    "desk_lamp",
+    "mug",
+    "plant_pot",
+    "soldering_station",
+    "spray_bottle",
+    "tape_dispenser",
+    "thermos",
+)
 """Names of the procedural objects that no tracker has a model of."""
 
 _registered: dict[str, Path] = {}

@@ -45,9 +45,7 @@ def klt3147() -> Design:
     rim = rounded_plate((length, width, 0.010), 0.012, KLT_BLUE).at(z=height - 0.010)
     collar = rounded_plate((length - 0.002, width - 0.002, 0.005), 0.012, KLT_BLUE).at(z=height - 0.042)
     base_ring = rounded_plate((length - 0.012, width - 0.012, 0.006), 0.014, KLT_BLUE).at(z=0.008)
-    ribs = [
-        plate((0.004, width - 0.003, 0.102), KLT_BLUE).at(x=x, z=0.008) for x in (-0.125, -0.075, 0.0, 0.075, 0.125)
-    ]
+    ribs = [plate((0.004, width - 0.003, 0.102), KLT_BLUE).at(x=x, z=0.008) for x in (-0.120, -0.060, 0.060, 0.120)]
     ribs += [plate((length - 0.003, 0.004, 0.102), KLT_BLUE).at(y=y, z=0.008) for y in (-0.075, -0.046, 0.046, 0.075)]
     short_ribs = [plate((0.004, width - 0.003, 0.030), KLT_BLUE).at(x=x, z=height - 0.038) for x in (-0.10, 0.10)]
     inside = tapered(
@@ -94,6 +92,12 @@ def materialbox() -> Design:
         (0.5 * length - 0.052, height),
         (-0.5 * length, height),
     ]
+    front = [
+        (0.5 * length - 0.020, 0.0),
+        (0.5 * length - 0.014, 0.0),
+        (0.5 * length, 0.036),
+        (0.5 * length - 0.006, 0.036),
+    ]
     hollow = [
         (-0.5 * length + wall, wall),
         (0.5 * length - 0.016, wall),
@@ -135,7 +139,7 @@ def materialbox() -> Design:
         collision=(
             plate((length - 0.014, width - 0.006, 0.006), BIN_RED).at(x=-0.007),
             plate((0.006, width - 0.002, height + 0.003), BIN_RED).at(x=-0.5 * length + 0.003),
-            plate((0.012, width - 0.002, 0.030), BIN_RED).at(x=0.5 * length - 0.007, z=0.010),
+            side_prism(front, width - 0.002, BIN_RED).at(z=0.003),
             *(side_prism(side, 0.006, BIN_RED).at(y=s * (0.5 * width - 0.004), z=0.003) for s in (-1, 1)),
         ),
         mass=0.16,
