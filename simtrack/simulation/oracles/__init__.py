@@ -1,0 +1,5 @@
+"""Stages that answer from ground truth with the errors of real ones: they implement the stages' own Protocols."""
+
+from simtrack.simulation.oracles.detector import OracleDetector, OracleDetectorConfig
+
+__all__ = ["OracleDetector", "OracleDetectorConfig"]

@@ -1,0 +1,99 @@
+"""Runs a detector beside the pipeline: its latency in simulated time, its failures as statuses."""
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from simtrack.contracts import (
+    NANOSECONDS,
+    CameraIntrinsics,
+    DetectionResult,
+    Detector,
+    PoseHypothesis,
+    RegionOfInterest,
+    RgbdFrame,
+    Status,
+)
+from simtrack.errors import InvalidValueError
+from simtrack.objects import ObjectModel
+from simtrack.perception.detection.pnp import PnpConfig, solve_pose
+
+
+@dataclass(frozen=True, slots=True)
+class RunnerConfig:
+    """Settings of `DetectorRunner`."""
+
+    patience: float = 3.0
+    """An answer that is later than this, in seconds of the frames' time, is not waited for."""
+    timeout: float = 30.0
+    """A call that has not returned after this, in seconds of the wall clock, is given up: the detector hangs."""
+    pnp: PnpConfig = PnpConfig()
+
+    def __post_init__(self) -> None:
+        if self.patience <= 0.0 or self.timeout <= 0.0:
+            raise InvalidValueError("RunnerConfig.patience, timeout", (self.patience, self.timeout), "> 0 s")
+
+
+class DetectorRunner:
+    """Hands one image at a time to a detector and gives out its answers when they are due.
+
+    A detector that raises, hangs or answers nonsense costs its answer and nothing else.
+    """
+
+    def __init__(
+        self, detector: Detector, models: Mapping[str, ObjectModel], config: RunnerConfig | None = None
+    ) -> None:
+        self.config = config or RunnerConfig()
+        self._detector, self._models = detector, dict(models)
+        self._free_at: int | None = None
+        self._waiting: list[tuple[DetectionResult, CameraIntrinsics]] = []
+        self._hanging: threading.Thread | None = None
+        self.status = Status.OK
+
+    def due(self, stamp: int) -> bool:
+        """Whether the detector would take an image with this stamp."""
+        return self._free_at is None or stamp >= self._free_at
+
+    def submit(self, frame: RgbdFrame, regions: Sequence[RegionOfInterest] = ()) -> DetectionResult | None:
+        """Start on an image; returns the answer that will be due later (for recordings), None if there is none."""
+        latest = frame.stamp + int(self.config.patience * NANOSECONDS)
+        result = self._call(frame, regions)
+        self._free_at = latest
+        if result is None:
+            self.status, self._free_at = Status.FAILED, frame.stamp + NANOSECONDS // 4
+            return None
+        if result.available > latest:
+            self.status = Status.DEGRADED
+            return None
+        self.status, self._free_at = result.status, max(result.available, frame.stamp + 1)
+        self._waiting.append((result, frame.intrinsics))
+        return result
+
+    def collect(self, now: int) -> list[PoseHypothesis]:
+        """Pose hypotheses of all answers that are due at `now`, nanoseconds."""
+        due = [w for w in self._waiting if w[0].available <= now]
+        self._waiting = [w for w in self._waiting if w[0].available > now]
+        hypotheses: list[PoseHypothesis] = []
+        for result, intrinsics in due:
+            for detection in result.detections:
+                model = self._models.get(detection.class_name)
+                if model is not None and detection.keypoints.shape == (9, 2):
+                    hypotheses += solve_pose(detection, model, intrinsics, result.stamp, self.config.pnp)
+        return hypotheses
+
+    def _call(self, frame: RgbdFrame, regions: Sequence[RegionOfInterest]) -> DetectionResult | None:
+        if self._hanging is not None and self._hanging.is_alive():
+            return None
+        answer: list[DetectionResult] = []
+
+        def work() -> None:
+            try:
+                answer.append(self._detector.detect(frame, regions))
+            except Exception:  # whatever a foreign detector raises is its failure, not the pipeline's
+                answer.clear()
+
+        self._hanging = threading.Thread(target=work, name="simtrack-detector", daemon=True)
+        self._hanging.start()
+        self._hanging.join(self.config.timeout)
+        good = answer and isinstance(answer[0], DetectionResult) and answer[0].stamp == frame.stamp
+        return answer[0] if good else None

@@ -1,0 +1,288 @@
+"""The perception stack as one function of a frame: localize, track, segment what is unknown, relate.
+
+Every stage is handed in or built from its defaults; none can see ground truth. A stage that fails on a frame says so in
+the belief's status and keeps its state.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from simtrack.contracts import (
+    Belief,
+    DetectionResult,
+    Detector,
+    Float64,
+    JointState,
+    LidarScan,
+    Localization,
+    Localizer,
+    Odometry,
+    PoseHypothesis,
+    Presegmentation,
+    Relation,
+    RgbdFrame,
+    SensorFrame,
+    StaticMap,
+    Status,
+    Tracker,
+    TrackerResult,
+)
+from simtrack.geometry.kinematics import KinematicTree
+from simtrack.geometry.transforms import is_rigid, skew
+from simtrack.objects import ObjectModel
+from simtrack.perception.believed_scene import BelievedScene
+from simtrack.perception.detection.runner import DetectorRunner, RunnerConfig
+from simtrack.perception.localization import LocalizerConfig, MeshLocalizer
+from simtrack.perception.scene_graph import SceneGraph, SceneGraphConfig
+from simtrack.perception.self_filter import SelfFilter
+from simtrack.perception.tracking.presegmentation import (
+    PresegmentationConfig,
+    presegment_camera,
+    presegment_lidar,
+)
+from simtrack.perception.tracking.tracker import ObjectTracker, TrackerConfig
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class StackConfig:
+    """Settings of all stages."""
+
+    runner: RunnerConfig = field(default_factory=RunnerConfig)
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
+    presegmentation: PresegmentationConfig = field(default_factory=PresegmentationConfig)
+    scene_graph: SceneGraphConfig = field(default_factory=SceneGraphConfig)
+
+
+class PerceptionStack:
+    """Turns sensor frames into beliefs.
+
+    ::
+
+        stack = PerceptionStack(static_map, models, robot, detector, T_map_base=start)
+        for frame in feed:
+            belief = stack.process(frame)  # a Belief for every RGB-D frame, None for the others
+    """
+
+    def __init__(
+        self,
+        static_map: StaticMap,
+        models: Mapping[str, ObjectModel],
+        robot: KinematicTree,
+        detector: Detector,
+        *,
+        T_map_base: Float64 | None = None,
+        config: StackConfig | None = None,
+        localizer: Localizer | None = None,
+        tracker: Tracker | None = None,
+    ) -> None:
+        """Build the stack.
+
+        Args:
+            static_map: the surveyed map.
+            models: class name -> model of every object that can be tracked.
+            robot: the robot's own body, to tell it from the world.
+            detector: finds objects in images.
+            T_map_base: (4, 4) start pose as the operator states it; None if unknown (global search).
+            config: settings.
+            localizer: replaces MICP-L.
+            tracker: replaces the ray-tracing tracker.
+
+        """
+        self.config = config or StackConfig()
+        self.believed = BelievedScene(static_map, models)
+        self.self_filter = SelfFilter(robot)
+        self.localizer = localizer or MeshLocalizer(
+            static_map,
+            self.config.localizer,
+            scene=self.believed.scene,
+            T_map_base=T_map_base,
+            self_filter=self._own_lidar_shots,
+        )
+        self.tracker = tracker or ObjectTracker(models, self.config.tracker)
+        self.graph = SceneGraph(static_map, models, self.config.scene_graph)
+        self.detections = DetectorRunner(detector, models, self.config.runner)
+        self.on_detection: Callable[[DetectionResult], None] | None = None
+        """Called with every answer of the detector as it is given (recorders listen here)."""
+        self._joints: deque[JointState] = deque(maxlen=64)
+        self._lidar: Presegmentation | None = None
+        self._belief: Belief | None = None
+        self._status: dict[str, Status] = {}
+        self._seconds: dict[str, float] = {}
+
+    def close(self) -> None:
+        """Release the scenes' memory."""
+        self.believed.close()
+        if isinstance(self.tracker, ObjectTracker):
+            self.tracker.close()
+
+    def wants_image(self, stamp: int) -> bool:
+        """Whether the colour of an image with this stamp would be looked at."""
+        return self.detections.due(stamp)
+
+    def process(self, frame: SensorFrame) -> Belief | None:
+        """Take one frame, in the order of arrival; returns what is believed after an RGB-D frame."""
+        match frame:
+            case Odometry():
+                self._guard("odometry", lambda: self.localizer.predict(frame), None)
+            case JointState():
+                if np.isfinite(frame.positions).all() and len(frame.positions) == len(frame.names):
+                    self._joints.append(frame)
+            case LidarScan():
+                self._take_scan(frame)
+            case RgbdFrame():
+                return self._take_image(frame)
+        return None
+
+    # ----------------------------------------------------------------------------------------------------------- stages
+
+    def _take_scan(self, scan: LidarScan) -> None:
+        with self._timed("localization"):
+            localization = self._guard("localization", lambda: self.localizer.update(scan), None)
+        if localization is not None:
+            self._status["localization"] = localization.status
+        if localization is None or localization.status in (Status.STALE, Status.NO_DATA, Status.FAILED):
+            return
+        with self._timed("presegmentation"):
+            self._lidar = self._guard("presegmentation", lambda: self._presegment_scan(scan), self._lidar)
+
+    def _presegment_scan(self, scan: LidarScan) -> Presegmentation:
+        return presegment_lidar(
+            scan,
+            lambda stamp: self.localizer.pose_at(stamp).T_map_base,
+            self.believed.scene,
+            self._own_lidar_shots(scan),
+            self.config.presegmentation,
+        )
+
+    def _take_image(self, frame: RgbdFrame) -> Belief:
+        if self._belief is not None and frame.stamp <= self._belief.stamp:
+            self._status["frame"] = Status.STALE
+            return self._repeat()
+        if not _usable(frame):
+            self._status["frame"] = Status.FAILED
+            return self._repeat() if self._belief is not None else self._nothing(frame.stamp)
+        self._status["frame"] = Status.OK if np.any(frame.depth > 0.0) else Status.NO_DATA
+
+        localization = self.localizer.pose_at(frame.stamp)
+        T_map_camera = localization.T_map_base @ frame.T_base_camera
+        covariance = _camera_covariance(localization, T_map_camera)
+
+        with self._timed("detection"):
+            hypotheses = self._guard("detection", lambda: self.detections.collect(frame.stamp), [])
+        with self._timed("tracking"):
+            tracked = self._track(frame, T_map_camera, covariance, hypotheses)
+        self.believed.update(tracked.tracks)
+        camera = None
+        if self.detections.due(frame.stamp):
+            with self._timed("presegmentation"):
+                camera = self._guard("presegmentation", lambda: self._presegment_image(frame, T_map_camera), None)
+            with self._timed("detection"):
+                self._detect(frame, camera)
+        with self._timed("scene_graph"):
+            relations = self._guard("scene_graph", lambda: self._relate(frame.stamp, tracked), frozenset())
+
+        self._belief = Belief(
+            stamp=frame.stamp,
+            localization=localization,
+            T_map_camera=T_map_camera,
+            tracks=tracked.tracks,
+            camera=camera,
+            lidar=self._lidar,
+            relations=relations,
+            status=dict(self._status),
+            stage_seconds=dict(self._seconds),
+        )
+        self._seconds.clear()
+        return self._belief
+
+    def _track(
+        self, frame: RgbdFrame, T_map_camera: Float64, covariance: Float64, hypotheses: Sequence[PoseHypothesis]
+    ) -> TrackerResult:
+        kept = self._belief.tracks if self._belief is not None else ()
+        fallback = TrackerResult(frame.stamp, kept, Status.FAILED)
+        result = self._guard(
+            "tracking", lambda: self.tracker.update(frame, T_map_camera, covariance, hypotheses), fallback
+        )
+        self._status["tracking"] = result.status
+        return result
+
+    def _presegment_image(self, frame: RgbdFrame, T_map_camera: Float64) -> Presegmentation:
+        own = self.self_filter.camera_mask(frame, self._joint_positions(frame.stamp))
+        return presegment_camera(frame, T_map_camera, self.believed.scene, own, self.config.presegmentation)
+
+    def _detect(self, frame: RgbdFrame, camera: Presegmentation | None) -> None:
+        result = self.detections.submit(frame, camera.regions if camera is not None else ())
+        self._status["detection"] = self.detections.status
+        if result is not None and self.on_detection is not None:
+            self.on_detection(result)
+
+    def _relate(self, stamp: int, tracked: TrackerResult) -> frozenset[Relation]:
+        return self.graph.update(stamp, tracked.tracks)
+
+    # ---------------------------------------------------------------------------------------------------------- support
+
+    def _own_lidar_shots(self, scan: LidarScan) -> np.ndarray:
+        return self.self_filter.lidar_mask(scan, self._joint_positions(scan.stamp))
+
+    def _joint_positions(self, stamp: int) -> dict[str, float]:
+        """Encoder readings nearest in time to a stamp."""
+        if not self._joints:
+            return {}
+        nearest = min(self._joints, key=lambda j: abs(j.stamp - stamp))
+        return dict(zip(nearest.names, nearest.positions.tolist(), strict=True))
+
+    def _guard(self, stage: str, work: Callable[[], T], fallback: T) -> T:
+        """Run a stage; what it raises on a frame's data becomes a status."""
+        try:
+            result = work()
+        except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError):
+            self._status[stage] = Status.FAILED
+            return fallback
+        self._status[stage] = Status.OK
+        return result
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def _repeat(self) -> Belief:
+        """The last belief again, with the present statuses."""
+        assert self._belief is not None
+        b = self._belief
+        return Belief(
+            b.stamp, b.localization, b.T_map_camera, b.tracks, None, b.lidar, b.relations, dict(self._status), {}
+        )
+
+    def _nothing(self, stamp: int) -> Belief:
+        """A belief before any usable image."""
+        localization = self.localizer.pose_at(stamp)
+        return Belief(
+            stamp, localization, localization.T_map_base, (), None, self._lidar, frozenset(), dict(self._status), {}
+        )
+
+
+def _usable(frame: RgbdFrame) -> bool:
+    """Whether a frame's arrays have the shapes that its intrinsics promise, and its pose is one."""
+    K = frame.intrinsics
+    focal = np.isfinite([K.fx, K.fy, K.cx, K.cy]).all() and K.fx > 0.0 and K.fy > 0.0
+    return frame.depth.shape == (K.height, K.width) and bool(focal) and is_rigid(frame.T_base_camera, 1e-4)
+
+
+def _camera_covariance(localization: Localization, T_map_camera: Float64) -> Float64:
+    """(6, 6) covariance of the camera's pose in the map: that of the base with the lever arm between them."""
+    J = np.eye(6)
+    J[:3, 3:] = -skew(T_map_camera[:3, 3] - localization.T_map_base[:3, 3])
+    return J @ localization.covariance @ J.T

@@ -1,0 +1,134 @@
+"""From a detection's pose hypotheses to a registered candidate: depth alignment, registration, comparison of fits."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from simtrack.contracts import CameraIntrinsics, Float32, Float64, PoseHypothesis
+from simtrack.perception.tracking.registration import (
+    Registration,
+    RegistrationConfig,
+    RegistrationResult,
+    Step,
+    TrackedModel,
+)
+
+PROBE = 0
+"""Instance id of the candidate in its own scene."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitConfig:
+    """When a registered candidate is believed to be there."""
+
+    support: float = 0.62
+    """Least share of its unoccluded rays that must confirm it."""
+    pixels: int = 60
+    """Fewest pixels that must confirm it."""
+    residual: float = 0.0045
+    """Largest RMS residual along the normal, metres, at 1 m distance; grows with its square."""
+    constrained: int = 4
+    """Fewest directions that the data must constrain."""
+    align_reach: float = 0.3
+    """Depth differences up to this are considered when a hypothesis is slid along its viewing ray, metres."""
+
+
+def cost(result: RegistrationResult, gate: float = 0.012) -> float:
+    """Mean squared residual of a registered pose, seen-through rays counting as `gate` metres; lower is better, m^2."""
+    seen = result.supported + result.missing
+    if seen == 0:
+        return np.inf
+    return (result.residual**2 * result.supported + gate**2 * result.missing) / seen
+
+
+def believable(result: RegistrationResult, config: FitConfig) -> bool:
+    """Whether a registered pose is well supported by the measurements."""
+    z = float(result.T_camera_object[2, 3])
+    return (
+        result.support >= config.support
+        and result.supported * result.stride**2 >= config.pixels
+        and result.residual <= config.residual * max(1.0, z) ** 2
+        and result.constrained >= config.constrained
+    )
+
+
+class Prober:
+    """Registers one candidate at a time in a scene of its own."""
+
+    def __init__(self, registration: RegistrationConfig, fit: FitConfig) -> None:
+        wide = Step(gate=0.06, kernel=16.0, edge_reach=18, silhouettes="always")
+        schedule = (wide, wide, *registration.schedule)
+        probe = replace(registration, schedule=schedule, max_rays=registration.max_rays // 2)
+        self._fit = fit
+        self._refine = registration.schedule[1:]
+        self._registration = Registration(probe)
+        self._model: TrackedModel | None = None
+
+    def close(self) -> None:
+        """Release the scene's memory."""
+        self._registration.close()
+
+    def best(
+        self,
+        hypotheses: Sequence[PoseHypothesis],
+        model: TrackedModel,
+        depth: Float32,
+        intrinsics: CameraIntrinsics,
+    ) -> RegistrationResult | None:
+        """Register each alternative and return the one that fits best, or None if none can be believed."""
+        results = [self._settle(h.T_camera_object, model, depth, intrinsics) for h in hypotheses]
+        good = [r for r in results if r is not None and believable(r, self._fit)]
+        return min(good, key=cost, default=None)
+
+    def follow(
+        self, T_camera_object: Float64, model: TrackedModel, depth: Float32, intrinsics: CameraIntrinsics
+    ) -> RegistrationResult | None:
+        """Register a candidate from a near pose, as the next frame of a track."""
+        self._show(model)
+        return self._registration.register(depth, intrinsics, {PROBE: T_camera_object}, schedule=self._refine).get(
+            PROBE
+        )
+
+    def judge(
+        self, T_camera_object: Float64, model: TrackedModel, depth: Float32, intrinsics: CameraIntrinsics
+    ) -> RegistrationResult | None:
+        """How well a pose fits as it stands."""
+        self._show(model)
+        return self._registration.assess(depth, intrinsics, {PROBE: T_camera_object}).get(PROBE)
+
+    def _show(self, model: TrackedModel) -> None:
+        if self._model is not model:
+            if self._model is not None:
+                self._registration.remove(PROBE)
+            self._registration.add(PROBE, model)
+            self._model = model
+
+    def _settle(
+        self, T_camera_object: Float64, model: TrackedModel, depth: Float32, intrinsics: CameraIntrinsics
+    ) -> RegistrationResult | None:
+        self._show(model)
+        T = self._align_depth(T_camera_object, depth, intrinsics)
+        return self._registration.register(depth, intrinsics, {PROBE: T}).get(PROBE)
+
+    def _align_depth(self, T_camera_object: Float64, depth: Float32, intrinsics: CameraIntrinsics) -> Float64:
+        """Slide the model along the viewing ray of its centre until its rendered depth matches the measured one.
+
+        The most frequent difference counts, not the mean: the window holds background and occluders too.
+        """
+        T = T_camera_object.copy()
+        for reach, width in ((self._fit.align_reach, 0.03), (0.08, 0.015)):
+            differences = self._registration.depth_differences(depth, intrinsics, PROBE, T, reach)
+            if len(differences) < 20:
+                return T
+            shift = _mode(differences, width)
+            T[:3, 3] *= (T[2, 3] + shift) / T[2, 3]
+        return T
+
+
+def _mode(values: Float64, width: float) -> float:
+    """Mean of the values in the fullest window of the given width, metres."""
+    ordered = np.sort(values)
+    ends = np.searchsorted(ordered, ordered + width, side="right")
+    start = int(np.argmax(ends - np.arange(len(ordered))))
+    return float(np.mean(ordered[start : ends[start]]))

@@ -1,0 +1,322 @@
+"""Correspondences between a depth image and ray-traced models, and their normal equations.
+
+Tracking paper, III.B: with the exact sensor model, each measured point ``D_i(P)`` is paired with the model point that its
+own viewing ray hits, ``D_i(P) -> M_i(P, N, O)``: position, normal and instance. All instances stand in one scene, so
+occlusion between objects is handled by construction. Beyond the paper, silhouette pixels add the offset between the
+model's edge and the depth discontinuity, which constrains what the visible faces leave free.
+
+Everything here is in the camera frame. Sums run in a fixed order.
+"""
+
+import numpy as np
+from numba import njit
+
+MISS, SUPPORTED, OCCLUDED, MISSING, INVALID = 0, 1, 2, 3, 4
+"""What a ray that hits a model says: nothing hit; measured there; something in front; seen through; no reading."""
+
+UNKNOWN_PIXEL = -2
+"""In an instance image: no ray was cast here. -1 is a miss."""
+
+FIELDS = 5
+"""Number of ray verdicts counted for each instance (columns of the counts)."""
+
+
+@njit(cache=True, nogil=True)
+def axial_variance(z: float, cosine: float, pixel_noise: float) -> float:
+    """Variance of a structured-light depth reading, m^2.
+
+    Nguyen et al. 2012 with the incidence angle clamped at 80 degrees, plus quantisation to 1/8 px of disparity for
+    ``f b = pixel_noise`` px m.
+    """
+    sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2
+    theta = np.arccos(min(1.0, max(cosine, 0.17364817766693033)))
+    if theta > np.pi / 3:
+        sigma += 0.0001 / np.sqrt(z) * theta * theta / (np.pi / 2 - theta) ** 2
+    step = z * z / pixel_noise / 8.0
+    return sigma * sigma + step * step / 12.0
+
+
+@njit(cache=True, nogil=True)
+def model_images(pixels, distances, instances, model_depth, model_instance):
+    """Scatter cast rays into images: `model_depth` (H, W) metres (0 = miss), `model_instance` (H, W) (-1 = miss)."""
+    width = model_depth.shape[1]
+    for i in range(pixels.shape[0]):
+        v, u = pixels[i] // width, pixels[i] % width
+        model_instance[v, u] = instances[i]
+        model_depth[v, u] = distances[i] if instances[i] >= 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def point_correspondences(
+    pixels, distances, normals, instances, depth, camera, strides, gates, model_sigma, focal_baseline,
+    measured, model, normal, weight, owner, counts,
+):  # fmt: skip
+    """Pair measured points with model points along the viewing rays; returns the number of pairs.
+
+    Args:
+        pixels: (N,) flat indices of the rays' pixels.
+        distances: (N,) model depth along the optical axis, metres, inf = miss.
+        normals: (N, 3) unit normals of the models.
+        instances: (N,) row of the model hit, -1 = miss.
+        depth: (H, W) measured, metres, 0 = no reading.
+        camera: (4,) fx, fy, cx, cy.
+        strides: (K,) pixel grid that each instance is sampled on.
+        gates: (K,) largest distance along the normal, metres.
+        model_sigma: surface error of the models, metres.
+        focal_baseline: focal length times baseline of the depth sensor, px m.
+        measured, model, normal: (M, 3) outputs, metres.
+        weight: (M,) output, inverse variance along the normal, 1/m^2.
+        owner: (M,) output, row of the instance.
+        counts: (K, FIELDS) output, rays by verdict.
+
+    """
+    width = depth.shape[1]
+    found = 0
+    for i in range(pixels.shape[0]):
+        k = instances[i]
+        if k < 0:
+            continue
+        v, u = pixels[i] // width, pixels[i] % width
+        if u % strides[k] != 0 or v % strides[k] != 0:
+            continue
+        x, y, z = (u - camera[2]) / camera[0], (v - camera[3]) / camera[1], distances[i]
+        d = depth[v, u]
+        if d <= 0.0:
+            counts[k, INVALID] += 1
+            continue
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        along = nx * x + ny * y + nz
+        length = np.sqrt(x * x + y * y + 1.0)
+        cosine = abs(along) / length
+        delta = d - z
+        variance = axial_variance(z, cosine, focal_baseline)
+        slack = 3.0 * np.sqrt(variance)
+        gate = gates[k] + slack * cosine
+        if abs(delta * along) > gate or abs(delta) > 3.0 * gate + slack:
+            if delta < 0.0:
+                counts[k, OCCLUDED] += 1
+            else:
+                counts[k, MISSING] += 1
+            continue
+        counts[k, SUPPORTED] += 1
+        if cosine < 0.17:
+            continue
+        lateral = 0.4 * z / camera[0]
+        noise = variance * along * along + lateral * lateral * (1.0 - cosine * cosine) + model_sigma * model_sigma
+        measured[found, 0], measured[found, 1], measured[found, 2] = d * x, d * y, d
+        model[found, 0], model[found, 1], model[found, 2] = z * x, z * y, z
+        normal[found, 0], normal[found, 1], normal[found, 2] = nx, ny, nz
+        weight[found], owner[found] = 1.0 / noise, k
+        found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _edge_offset(depth, model_depth, model_instance, k, u, v, du, dv, z, reach, step_depth, tolerance):
+    """Offset in pixels along (du, dv) from pixel (u, v) to the depth discontinuity nearest to it; NaN if there is none."""
+    height, width = depth.shape
+    best = np.nan
+    last_on, run = -1000, 0
+    for j in range(-reach, reach + 1):
+        x, y = int(np.floor(u + j * du + 0.5)), int(np.floor(v + j * dv + 0.5))
+        if x < 0 or y < 0 or x >= width or y >= height:
+            break
+        d = depth[y, x]
+        if d <= 0.0:
+            continue  # the projector's shadow lies on the background beside the edge
+        reference = model_depth[y, x] if model_instance[y, x] == k and model_depth[y, x] > 0.0 else z
+        if abs(d - reference) < tolerance:
+            last_on, run = j, run + 1
+        elif d > max(reference, z) + step_depth:
+            if run >= 2 and j - last_on <= 12:
+                offset = last_on + 0.5
+                if not abs(offset) >= abs(best):  # also true while best is NaN
+                    best = offset
+            run = 0
+        else:
+            run = 0  # something in front, or a surface that runs on: no silhouette here
+    return best
+
+
+@njit(cache=True, nogil=True)
+def edge_correspondences(
+    pixels, instances, depth, model_depth, model_instance, camera, strides, reach, step_depth, focal_baseline,
+    point, direction, offset, weight, owner,
+):  # fmt: skip
+    """Pair the models' silhouettes with depth discontinuities; returns the number of pairs.
+
+    For a silhouette pixel with outward image direction d the measured discontinuity is sought along d. Outputs:
+    `point` (M, 3) model point, metres; `direction` (M, 2) d; `offset` (M,) pixels that the silhouette has to move along d;
+    `weight` (M,) 1/px^2; `owner` (M,) row of the instance.
+    """
+    height, width = depth.shape
+    found = 0
+    for i in range(pixels.shape[0]):
+        k = instances[i]
+        if k < 0 or found >= offset.shape[0]:
+            continue
+        v, u = pixels[i] // width, pixels[i] % width
+        s = strides[k]
+        if u % s != 0 or v % s != 0:
+            continue
+        z = model_depth[v, u]
+        edge = False
+        for side in range(4):
+            x = u + s * ((side == 0) - (side == 1))
+            y = v + s * ((side == 2) - (side == 3))
+            if x < 0 or y < 0 or x >= width or y >= height:
+                continue
+            other = model_instance[y, x]
+            if other == -1 or (other >= 0 and other != k and model_depth[y, x] > z + step_depth):
+                edge = True
+        if not edge:
+            continue
+        gu, gv, inside = 0.0, 0.0, 0
+        for b in range(-2, 3):
+            for a in range(-2, 3):
+                x, y = u + a * s, v + b * s
+                if 0 <= x < width and 0 <= y < height and model_instance[y, x] == k:
+                    gu -= a
+                    gv -= b
+                    inside += 1
+        norm = np.sqrt(gu * gu + gv * gv)
+        if norm < 4.0 or inside < 6:
+            continue  # thin parts and corners have no clear direction
+        du, dv = gu / norm, gv / norm
+        tolerance = 0.012 + 3.0 * np.sqrt(axial_variance(z, 0.7, focal_baseline))
+        shift = _edge_offset(depth, model_depth, model_instance, k, u, v, du, dv, z, reach, step_depth, tolerance)
+        if np.isnan(shift):
+            continue
+        point[found, 0], point[found, 1] = z * (u - camera[2]) / camera[0], z * (v - camera[3]) / camera[1]
+        point[found, 2] = z
+        direction[found, 0], direction[found, 1] = du, dv
+        offset[found] = shift - 0.5 * s
+        weight[found] = 1.0 / (0.64 + 0.1 * s * s)
+        owner[found] = k
+        found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def point_normal_equations(measured, model, normal, weight, owner, centres, rotations, shifts, kernel, H, g, stats):
+    """Accumulate robust point-to-plane normal equations of every instance.
+
+    The models have moved since the cast by ``m' = c + R (m - c) + t`` about their `centres` (K, 3); `rotations` (K, 3, 3),
+    `shifts` (K, 3). Residual ``r = n . (p - m')``, Geman-McClure weights with scale `kernel` (K,) in standard deviations.
+    Outputs: `H` (K, 6, 6) and `g` (K, 6) with ``H xi = g``; `stats` (K, 3): weighted pairs, sum of w r^2 in units of the
+    variance, sum of squared residuals of inliers in m^2.
+    """
+    J = np.empty(6)
+    for i in range(owner.shape[0]):
+        k = owner[i]
+        R = rotations[k]
+        ax, ay, az = model[i, 0] - centres[k, 0], model[i, 1] - centres[k, 1], model[i, 2] - centres[k, 2]
+        bx = R[0, 0] * ax + R[0, 1] * ay + R[0, 2] * az
+        by = R[1, 0] * ax + R[1, 1] * ay + R[1, 2] * az
+        bz = R[2, 0] * ax + R[2, 1] * ay + R[2, 2] * az
+        nx = R[0, 0] * normal[i, 0] + R[0, 1] * normal[i, 1] + R[0, 2] * normal[i, 2]
+        ny = R[1, 0] * normal[i, 0] + R[1, 1] * normal[i, 1] + R[1, 2] * normal[i, 2]
+        nz = R[2, 0] * normal[i, 0] + R[2, 1] * normal[i, 1] + R[2, 2] * normal[i, 2]
+        r = (
+            nx * (measured[i, 0] - centres[k, 0] - shifts[k, 0] - bx)
+            + ny * (measured[i, 1] - centres[k, 1] - shifts[k, 1] - by)
+            + nz * (measured[i, 2] - centres[k, 2] - shifts[k, 2] - bz)
+        )
+        squared = r * r * weight[i]
+        scale = kernel[k] * kernel[k]
+        robust = (scale / (scale + squared)) ** 2
+        w = weight[i] * robust
+        J[0], J[1], J[2] = nx, ny, nz
+        J[3], J[4], J[5] = by * nz - bz * ny, bz * nx - bx * nz, bx * ny - by * nx
+        for a in range(6):
+            g[k, a] += w * J[a] * r
+            for b in range(a, 6):
+                H[k, a, b] += w * J[a] * J[b]
+        stats[k, 0] += robust
+        stats[k, 1] += robust * squared
+        stats[k, 2] += robust * r * r
+
+
+@njit(cache=True, nogil=True)
+def edge_normal_equations(
+    point, direction, offset, weight, owner, camera, centres, rotations, shifts, kernel, H, g, stats
+):  # fmt: skip
+    """Accumulate the normal equations of silhouette offsets, which move the models' edges in the image.
+
+    As `point_normal_equations`; residual in pixels ``r = offset - d . (proj(m') - proj(m))``; `stats` (K, 2): pairs, sum
+    of w r^2.
+    """
+    J = np.empty(6)
+    for i in range(owner.shape[0]):
+        k = owner[i]
+        R = rotations[k]
+        x, y, z = point[i, 0], point[i, 1], point[i, 2]
+        ax, ay, az = x - centres[k, 0], y - centres[k, 1], z - centres[k, 2]
+        bx = R[0, 0] * ax + R[0, 1] * ay + R[0, 2] * az
+        by = R[1, 0] * ax + R[1, 1] * ay + R[1, 2] * az
+        bz = R[2, 0] * ax + R[2, 1] * ay + R[2, 2] * az
+        mx, my, mz = (
+            bx + shifts[k, 0] + centres[k, 0],
+            by + shifts[k, 1] + centres[k, 1],
+            bz + shifts[k, 2] + centres[k, 2],
+        )
+        du, dv = direction[i, 0], direction[i, 1]
+        moved = du * camera[0] * (mx / mz - x / z) + dv * camera[1] * (my / mz - y / z)
+        r = offset[i] - moved
+        # gradient of d . proj(m') with respect to m'
+        px, py = du * camera[0] / mz, dv * camera[1] / mz
+        pz = -(px * mx + py * my) / mz
+        squared = r * r * weight[i]
+        scale = kernel * kernel
+        robust = (scale / (scale + squared)) ** 2
+        w = weight[i] * robust
+        J[0], J[1], J[2] = px, py, pz
+        J[3], J[4], J[5] = by * pz - bz * py, bz * px - bx * pz, bx * py - by * px
+        for a in range(6):
+            g[k, a] += w * J[a] * r
+            for b in range(a, 6):
+                H[k, a, b] += w * J[a] * J[b]
+        stats[k, 0] += robust
+        stats[k, 1] += robust * squared
+
+
+@njit(cache=True, nogil=True)
+def umeyama_sums(measured, model, normal, owner, centres, rotations, shifts, count, mean_p, mean_q, cross):
+    """First and second moments of the correspondences for a closed-form rigid fit of every instance.
+
+    The model's partner ``q`` of a measured point ``p`` is its foot on the tangent plane at the ray's hit. Outputs are
+    plain sums: `count` (K,), `mean_p`, `mean_q` (K, 3), `cross` (K, 3, 3) of ``p q^T``, about `centres`.
+    """
+    for i in range(owner.shape[0]):
+        k = owner[i]
+        R = rotations[k]
+        b, n, p = np.empty(3), np.empty(3), np.empty(3)
+        for a in range(3):
+            b[a], n[a] = shifts[k, a], 0.0
+            for c in range(3):
+                b[a] += R[a, c] * (model[i, c] - centres[k, c])
+                n[a] += R[a, c] * normal[i, c]
+            p[a] = measured[i, a] - centres[k, a]
+        r = n[0] * (p[0] - b[0]) + n[1] * (p[1] - b[1]) + n[2] * (p[2] - b[2])
+        count[k] += 1
+        for a in range(3):
+            q = p[a] - r * n[a]
+            mean_p[k, a] += p[a]
+            mean_q[k, a] += q
+        for a in range(3):
+            for c in range(3):
+                cross[k, a, c] += p[a] * (p[c] - r * n[c])
+
+
+@njit(cache=True, nogil=True)
+def ray_differences(pixels, distances, instances, depth, row, reach, out):
+    """Measured minus model depth on the rays that hit instance `row`, where within `reach` metres; returns their number."""
+    width = depth.shape[1]
+    found = 0
+    for i in range(pixels.shape[0]):
+        if instances[i] == row:
+            d = depth[pixels[i] // width, pixels[i] % width]
+            if d > 0.0 and abs(d - distances[i]) < reach:
+                out[found] = d - distances[i]
+                found += 1
+    return found

@@ -1,0 +1,288 @@
+"""Pre-segmentation: measurements that nothing in the believed world explains (tracking paper, III.C).
+
+A measurement is explained if it lies on the surface of the map, of a tracked object or of the robot's own body, within
+what sensor, map and pose may be wrong. What remains is clustered and handed on as regions of interest: the paper's
+reduction of a scan "without losing relevant information at all".
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from simtrack.contracts import (
+    Bool,
+    CameraIntrinsics,
+    Float32,
+    Float64,
+    Int32,
+    LidarScan,
+    Presegmentation,
+    RegionOfInterest,
+    RgbdFrame,
+    Status,
+)
+from simtrack.errors import InvalidValueError
+from simtrack.geometry.transforms import apply
+from simtrack.perception.tracking.correspondences import axial_variance
+from simtrack.raycast import RayBundle, RayScene
+
+
+@dataclass(frozen=True, slots=True)
+class PresegmentationConfig:
+    """Settings of `presegment_camera` and `presegment_lidar`."""
+
+    stride: int = 2
+    """Pixel grid on which the believed world is cast; measurements are tested at full resolution."""
+    map_sigma: float = 0.006
+    """Standard deviation of the map's surface and of the pose, metres."""
+    tolerance: float = 0.017
+    """Largest allowance for map and pose, metres; 2.5 sigma of the sensor are added."""
+    focal_baseline: float = 577.0 * 0.075
+    """Focal length times baseline of the depth sensor, px m (Xtion)."""
+    lidar_sigma: float = 0.012
+    """Standard deviation of a lidar range, metres."""
+    max_range: float = 5.0
+    """Depth readings further away are too coarse to tell anything, metres: they count as explained."""
+    join: float = 0.025
+    """Neighbouring pixels belong to one cluster if their depth differs by less than this at 1 m, metres (grows with
+    the square of the distance)."""
+    min_pixels: int = 60
+    """Smaller camera clusters are noise."""
+    lidar_join: float = 0.25
+    """Lidar points nearer than this belong to one cluster, metres."""
+    min_points: int = 4
+    """Smaller lidar clusters are noise."""
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise InvalidValueError("PresegmentationConfig.stride", self.stride, ">= 1")
+
+
+def presegment_camera(
+    frame: RgbdFrame,
+    T_map_camera: Float64,
+    scene: RayScene,
+    own_body: Bool | None = None,
+    config: PresegmentationConfig | None = None,
+) -> Presegmentation:
+    """Find what the believed world does not explain in a depth image.
+
+    Args:
+        frame: depth (H, W), metres.
+        T_map_camera: (4, 4), believed.
+        scene: map and tracked objects, map frame.
+        own_body: (H, W), True where the robot sees itself; None if it does not.
+        config: settings.
+
+    """
+    config = config or PresegmentationConfig()
+    depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0.0), frame.depth, np.float32(0.0)).astype(np.float32)
+    near = depth <= config.max_range
+    valid = int(np.count_nonzero(depth))
+    if valid == 0:
+        empty = np.zeros(depth.shape, bool)
+        return Presegmentation(frame.stamp, empty, 0, empty.astype(np.int32), (), "camera", Status.NO_DATA)
+    K = frame.intrinsics
+    bundle = RayBundle.from_camera(K, stride=config.stride)
+    hits = scene.cast(bundle, T_map_camera)
+    camera = np.array([K.fx, K.fy, K.cx, K.cy])
+    normals = hits.normals @ T_map_camera[:3, :3].astype(np.float32)
+    unknown = np.zeros(depth.shape, bool)
+    _unexplained_pixels(
+        depth, hits.distances.reshape(bundle.shape), normals.reshape(*bundle.shape, 3), camera, config.stride,
+        config.map_sigma, config.tolerance, config.focal_baseline, unknown,
+    )  # fmt: skip
+    unknown &= near
+    if own_body is not None:
+        unknown &= ~own_body
+    labels, count = _label_pixels(unknown, depth, config.join, config.min_pixels)
+    regions = _camera_regions(labels, count, depth, K, T_map_camera, frame.stamp)
+    return Presegmentation(frame.stamp, unknown, valid, labels, regions, "camera")
+
+
+def presegment_lidar(
+    scan: LidarScan,
+    pose_at: Callable[[int], Float64],
+    scene: RayScene,
+    own_body: Bool | None = None,
+    config: PresegmentationConfig | None = None,
+) -> Presegmentation:
+    """Find what the believed world does not explain in a scan.
+
+    Args:
+        scan: one turn; each shot is cast from the sensor's pose at its own time.
+        pose_at: stamp in nanoseconds -> T_map_base (4, 4), believed.
+        scene: map and tracked objects, map frame.
+        own_body: (N,), True where the robot sees itself; None if it does not.
+        config: settings.
+
+    """
+    config = config or PresegmentationConfig()
+    measured = np.isfinite(scan.ranges) & (scan.ranges > 0.0)
+    valid = int(np.count_nonzero(measured))
+    unknown = np.zeros(scan.ranges.shape, bool)
+    if valid == 0:
+        return Presegmentation(scan.stamp, unknown, 0, unknown.astype(np.int32), (), "lidar", Status.NO_DATA)
+    origins, directions = shot_rays(scan, pose_at)
+    index = np.flatnonzero(measured if own_body is None else measured & ~own_body)
+    hits = scene.cast_rays(origins[index], directions[index])
+    ranges = scan.ranges[index].astype(float)
+    reach = min(3.0 * float(np.hypot(config.lidar_sigma, config.map_sigma)), 3.0 * config.lidar_sigma + 0.02)
+    along = np.abs(np.einsum("ij,ij->i", hits.normals, directions[index]))
+    difference = np.abs(ranges - np.where(np.isfinite(hits.distances), hits.distances, 1e9))
+    explained = (difference * along < reach) & (difference < 0.5)
+    open_ = index[~explained]
+    points = origins[open_] + scan.ranges[open_, None] * directions[open_]
+    nearest = scene.closest_points(points, reach)
+    stray = ~np.isfinite(nearest.distances)
+    unknown[open_[stray]] = True
+    labels = np.zeros(len(unknown), np.int32)
+    clusters, count = _cluster_points(points[stray], config.lidar_join, config.min_points)
+    labels[open_[stray]] = clusters
+    regions = tuple(
+        _region(scan.stamp, points[stray][clusters == k], np.zeros(4), "lidar") for k in range(1, count + 1)
+    )
+    return Presegmentation(scan.stamp, unknown, valid, labels, regions, "lidar")
+
+
+def shot_rays(scan: LidarScan, pose_at: Callable[[int], Float64]) -> tuple[Float64, Float64]:
+    """Origins and unit directions (N, 3) of a scan's shots in the map, each from the sensor's pose at its own time."""
+    last = float(scan.times.max()) if len(scan.times) else 0.0
+    knots = np.linspace(0.0, max(last, 1e-6), 5)
+    poses = np.stack([pose_at(scan.stamp + int(t * 1e9)) @ scan.T_base_lidar for t in knots])
+    position = np.clip(scan.times.astype(float) / knots[1], 0.0, 3.999999)
+    lower = position.astype(int)
+    fraction = (position - lower)[:, None]
+    d = scan.directions.astype(float)
+    a, b = poses[lower], poses[lower + 1]
+    directions = (1.0 - fraction) * np.einsum("nij,nj->ni", a[:, :3, :3], d)
+    directions += fraction * np.einsum("nij,nj->ni", b[:, :3, :3], d)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return (1.0 - fraction) * a[:, :3, 3] + fraction * b[:, :3, 3], directions
+
+
+@njit(cache=True, nogil=True)
+def _unexplained_pixels(
+    depth, model_depth, normals, camera, stride, map_sigma, tolerance, focal_baseline, unknown
+):  # fmt: skip
+    """Mark (H, W) readings further from the tangent planes of nearby model points than sensor, map and pose allow."""
+    height, width = depth.shape
+    rows, columns = model_depth.shape
+    for v in range(height):
+        for u in range(width):
+            d = depth[v, u]
+            if d <= 0.0:
+                continue
+            x, y = d * (u - camera[2]) / camera[0], d * (v - camera[3]) / camera[1]
+            variance = axial_variance(d, 0.9, focal_baseline)
+            sigma = np.sqrt(variance)
+            limit = min(3.0 * np.sqrt(variance + map_sigma * map_sigma), 2.5 * sigma + tolerance)
+            lateral = 3.0 * stride * d / camera[0] + limit
+            row, column = v // stride, u // stride
+            explained = False
+            for ring in range(3):  # the pixel's own ray first: it explains nearly all
+                for b in range(-ring, ring + 1):
+                    for a in range(-ring, ring + 1):
+                        if explained or max(abs(a), abs(b)) != ring:
+                            continue
+                        i, j = row + b, column + a
+                        if i < 0 or j < 0 or i >= rows or j >= columns:
+                            continue
+                        z = model_depth[i, j]
+                        if not z < 1e6:
+                            continue
+                        ex = x - z * (j * stride - camera[2]) / camera[0]
+                        ey = y - z * (i * stride - camera[3]) / camera[1]
+                        ez = d - z
+                        off = abs(ex * normals[i, j, 0] + ey * normals[i, j, 1] + ez * normals[i, j, 2])
+                        if off < limit and ex * ex + ey * ey + ez * ez < lateral * lateral + 25.0 * off * off:
+                            explained = True
+                if explained:
+                    break
+            unknown[v, u] = not explained
+
+
+@njit(cache=True, nogil=True)
+def _label_pixels(unknown, depth, join, min_pixels):
+    """Connected regions of unknown pixels without depth steps; returns labels (H, W) from 1 and their number."""
+    height, width = depth.shape
+    labels = np.zeros((height, width), np.int32)
+    stack = np.empty(height * width, np.int32)
+    count = 0
+    for start in range(height * width):
+        v0, u0 = start // width, start % width
+        if not unknown[v0, u0] or labels[v0, u0] != 0:
+            continue
+        count += 1
+        size, top, seen = 1, 1, 0
+        stack[0] = start
+        labels[v0, u0] = count
+        # The stack doubles as the list of members: it is never overwritten before `seen`.
+        while seen < top:
+            pixel = stack[seen]
+            seen += 1
+            v, u = pixel // width, pixel % width
+            d = depth[v, u]
+            for b in range(-2, 3):
+                for a in range(-2, 3):
+                    y, x = v + b, u + a
+                    if y < 0 or x < 0 or y >= height or x >= width or labels[y, x] != 0 or not unknown[y, x]:
+                        continue
+                    if abs(depth[y, x] - d) < join * max(d * d, 1.0):
+                        labels[y, x] = count
+                        stack[top] = y * width + x
+                        top += 1
+                        size += 1
+        if size < min_pixels:
+            for i in range(top):
+                labels[stack[i] // width, stack[i] % width] = -1
+            count -= 1
+    for v in range(height):
+        for u in range(width):
+            labels[v, u] = max(labels[v, u], 0)
+    return labels, count
+
+
+def _camera_regions(
+    labels: Int32, count: int, depth: Float32, K: CameraIntrinsics, T_map_camera: Float64, stamp: int
+) -> tuple[RegionOfInterest, ...]:
+    rows, columns = np.nonzero(labels)
+    owner = labels[rows, columns]
+    order = np.argsort(owner, kind="stable")
+    starts = np.searchsorted(owner[order], np.arange(1, count + 2))
+    regions = []
+    for k in range(count):
+        members = order[starts[k] : starts[k + 1]]
+        v, u = rows[members], columns[members]
+        d = depth[v, u].astype(float)
+        points = apply(T_map_camera, np.stack([d * (u - K.cx) / K.fx, d * (v - K.cy) / K.fy, d], axis=1))
+        box = np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float)
+        regions.append(_region(stamp, points, box, "camera"))
+    return tuple(regions)
+
+
+def _cluster_points(points: Float64, distance: float, min_points: int) -> tuple[Int32, int]:
+    """Euclidean clusters of (N, 3) points: labels from 1 (0 = in no cluster of `min_points`) and their number."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    labels = np.zeros(len(points), np.int32)
+    if len(points) < min_points:
+        return labels, 0
+    pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
+    ones = np.ones(len(pairs), bool)
+    graph = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
+    _, component = connected_components(graph, directed=False)
+    sizes = np.bincount(component)
+    kept = np.flatnonzero(sizes >= min_points)
+    number = np.zeros(len(sizes), np.int32)
+    number[kept] = np.arange(1, len(kept) + 1)
+    return number[component], len(kept)
+
+
+def _region(stamp: int, points: Float64, box: Float64, sensor: str) -> RegionOfInterest:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return RegionOfInterest(stamp, box, 0.5 * (low + high), high - low, len(points), sensor)

@@ -1,0 +1,459 @@
+"""Tracks of objects with known models: registration, filtering, data association and life cycle.
+
+Per frame (tracking paper, III.B): all tracked instances stand in one scene; rays are traced, each instance is registered
+to the depth image and its filter takes the result. Rays say what became of an object that is not confirmed: something in
+front of it (occluded: kept) or nothing where its surface should be (gone: pruned). Detections arrive late; they are
+matched, born and fused at the stamp of their image and replayed through the depth images since.
+"""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from simtrack.contracts import (
+    NANOSECONDS,
+    CameraIntrinsics,
+    Float32,
+    Float64,
+    PoseHypothesis,
+    RgbdFrame,
+    Status,
+    Track,
+    TrackerResult,
+    TrackStatus,
+)
+from simtrack.errors import UnknownNameError
+from simtrack.geometry.transforms import inverse, rotate_covariance, skew
+from simtrack.objects import ObjectModel
+from simtrack.perception.tracking.association import (
+    assign,
+    association_cost,
+    box_overlap,
+    group_by_detection,
+    nearest_equivalent,
+    rotation_apart,
+)
+from simtrack.perception.tracking.birth import FitConfig, Prober, believable, cost
+from simtrack.perception.tracking.filter import FilterConfig, Measurement, PoseFilter
+from simtrack.perception.tracking.registration import (
+    Registration,
+    RegistrationConfig,
+    RegistrationResult,
+    TrackedModel,
+)
+from simtrack.raycast import TriangleMesh
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerConfig:
+    """Settings of `ObjectTracker`."""
+
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    filter: FilterConfig = field(default_factory=FilterConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    buffer: float = 0.5
+    """Depth images are kept this long for late detections, seconds."""
+    confirm_detections: int = 2
+    """Detections that a new object needs before it is believed."""
+    confirm_frames: int = 3
+    """Registered frames that a new object needs before it is believed."""
+    tentative_timeout: float = 1.2
+    """A new object that is not confirmed within this time is dropped, seconds."""
+    lost_after: float = 0.25
+    """An object that should be visible and is not is lost after this time, seconds."""
+    keep_support: float = 0.4
+    """Least share of unoccluded rays that must confirm a track for its registration to count."""
+    min_rays: int = 16
+    """Fewest confirming rays for a registration to count."""
+    max_jump: float = 0.08
+    """A registration that moves a track further than this from its prediction, metres, is not believed."""
+    disagreement: float = np.deg2rad(25.0)
+    """Detections that differ from a registered track by more than this put its orientation to the test, radians."""
+    localization_correlation: float = 0.3
+    """Time over which errors of the robot's pose are correlated, seconds."""
+    same_object_speed: float = 0.7
+    """An object of the same class that appears within reach of one that was being moved is that one, m/s."""
+    same_object_memory: float = 4.0
+    """... if that one was last seen at most this long ago, seconds."""
+
+
+@dataclass(slots=True)
+class _View:
+    """A depth image with the camera's pose at its stamp."""
+
+    stamp: int
+    depth: Float32
+    intrinsics: CameraIntrinsics
+    T_map_camera: Float64
+    covariance: Float64
+
+
+@dataclass(slots=True)
+class _Target:
+    """All that is kept of one object."""
+
+    id: int
+    model: ObjectModel
+    filter: PoseFilter
+    born: int
+    status: TrackStatus = TrackStatus.TENTATIVE
+    detections: int = 1
+    frames: int = 0
+    last_seen: int = 0
+    missing_since: int | None = None
+    disagreements: int = 0
+    moved_when_seen: bool = False
+    score: float = 0.5
+    visible_fraction: float = 0.0
+    residual: float = 0.0
+    result: RegistrationResult | None = None
+
+    @property
+    def alive(self) -> bool:
+        return self.status is not TrackStatus.LOST
+
+
+class ObjectTracker:
+    """Tracker of the objects whose models it is given; implements `simtrack.contracts.Tracker`.
+
+    ::
+
+        tracker = ObjectTracker({"relay": load_object("relay")})
+        result = tracker.update(frame, T_map_camera, covariance, hypotheses)
+    """
+
+    def __init__(self, models: Mapping[str, ObjectModel], config: TrackerConfig | None = None) -> None:
+        self.config = config or TrackerConfig()
+        self._models = dict(models)
+        self._tracked = {name: tracked_model(model) for name, model in self._models.items()}
+        self._registration = Registration(self.config.registration)
+        self._prober = Prober(self.config.registration, self.config.fit)
+        self._targets: list[_Target] = []
+        self._next_id = 1
+        self._views: deque[_View] = deque()
+
+    def close(self) -> None:
+        """Release the scenes' memory."""
+        self._registration.close()
+        self._prober.close()
+
+    # ------------------------------------------------------------------------------------------------------- the frame
+
+    def update(
+        self,
+        frame: RgbdFrame,
+        T_map_camera: Float64,
+        covariance: Float64,
+        hypotheses: Sequence[PoseHypothesis] = (),
+    ) -> TrackerResult:
+        """Fuse one depth image and what detectors said of this or earlier images.
+
+        Args:
+            frame: depth (H, W), metres, 0 = no reading; its colour is not used.
+            T_map_camera: (4, 4), the robot's belief.
+            covariance: (6, 6) of it, map frame.
+            hypotheses: pose hypotheses of images whose stamps lie within the buffer.
+
+        Raises:
+            UnknownNameError: a hypothesis of a class without a model.
+
+        """
+        for h in hypotheses:
+            if h.class_name not in self._models:
+                raise UnknownNameError("object class", h.class_name, self._models)
+        if self._views and frame.stamp <= self._views[-1].stamp:
+            return TrackerResult(frame.stamp, self._tracks(self._views[-1]), Status.STALE)
+        depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0.0), frame.depth, np.float32(0.0))
+        view = _View(frame.stamp, depth.astype(np.float32), frame.intrinsics, T_map_camera, covariance)
+        self._views.append(view)
+        while view.stamp - self._views[0].stamp > self.config.buffer * NANOSECONDS:
+            self._views.popleft()
+        status = Status.OK if np.any(depth) else Status.NO_DATA
+        self._register(view)
+        self._take_detections(hypotheses)
+        self._prune(view.stamp)
+        return TrackerResult(frame.stamp, self._tracks(view), status)
+
+    def _register(self, view: _View) -> None:
+        """Register all living targets to a view and judge each."""
+        T_camera_map = inverse(view.T_map_camera)
+        living = [t for t in self._targets if t.alive]
+        poses = {t.id: T_camera_map @ t.filter.predict(view.stamp).T_map_object for t in living}
+        results = {}
+        if np.any(view.depth):
+            steps = self.config.registration.track_schedule
+            results = self._registration.register(view.depth, view.intrinsics, poses, schedule=steps)
+        for target in living:
+            self._judge(target, view, poses[target.id], results.get(target.id))
+
+    def _judge(self, target: _Target, view: _View, T_predicted: Float64, result: RegistrationResult | None) -> None:
+        """What one registration says of a target: seen, occluded, out of view or missing."""
+        config = self.config
+        target.result = result
+        inside = _share_in_image(target.model, T_predicted, view.intrinsics)
+        if result is None or result.rays < config.min_rays:
+            target.filter.skip(view.stamp)
+            target.visible_fraction, target.missing_since = 0.0, None
+            if target.status is not TrackStatus.TENTATIVE:
+                hidden = inside > 0.5 and T_predicted[2, 3] > 0.0
+                target.status = TrackStatus.OCCLUDED if hidden else TrackStatus.OUT_OF_VIEW
+            return
+        target.visible_fraction = result.supported / max(result.rays, 1) * inside
+        jump = float(np.linalg.norm(result.T_camera_object[:3, 3] - T_predicted[:3, 3]))
+        supported = result.supported >= config.min_rays and result.support >= config.keep_support
+        if supported and jump <= config.max_jump and result.constrained >= 1:
+            self._measure(target, view, result)
+            return
+        target.filter.skip(view.stamp)
+        valid = result.supported + result.occluded + result.missing
+        if result.missing > 0.35 * max(valid, 1) and result.missing > 2 * result.supported:
+            if target.missing_since is None:
+                target.missing_since = view.stamp
+            if view.stamp - target.missing_since >= config.lost_after * NANOSECONDS:
+                self._lose(target)
+            return
+        if valid < 0.2 * result.rays:
+            return  # hardly any reading: nothing was learned
+        target.missing_since = None
+        if target.status is not TrackStatus.TENTATIVE:
+            target.status = TrackStatus.OCCLUDED if inside > 0.3 else TrackStatus.OUT_OF_VIEW
+
+    def _measure(self, target: _Target, view: _View, result: RegistrationResult) -> None:
+        """Fuse an accepted registration."""
+        target.filter.update(self._measurement(view, result, target.last_seen))
+        target.frames += 1
+        target.last_seen = view.stamp
+        target.missing_since = None
+        target.residual = result.residual
+        target.moved_when_seen = target.filter.state.moving
+        target.score = min(0.99, target.score + 0.05)
+        enough = target.detections >= self.config.confirm_detections and target.frames >= self.config.confirm_frames
+        if enough or target.status is not TrackStatus.TENTATIVE:
+            target.status = TrackStatus.CONFIRMED
+
+    def _measurement(self, view: _View, result: RegistrationResult, last_seen: int) -> Measurement:
+        """A registration in the map frame; the camera's own error wanders, correlated over time."""
+        R = view.T_map_camera[:3, :3]
+        elapsed = max(view.stamp - last_seen, 0) / NANOSECONDS
+        share = 2.0 * (1.0 - np.exp(-elapsed / self.config.localization_correlation))
+        drift = share * camera_error_at(view, view.T_map_camera @ result.T_camera_object)
+        return Measurement(
+            view.stamp, view.T_map_camera @ result.T_camera_object, rotate_covariance(R, result.covariance), drift
+        )
+
+    def _lose(self, target: _Target) -> None:
+        """Take a target out of the scene; its identity is kept for when the object turns up again."""
+        if target.status is TrackStatus.TENTATIVE:
+            self._targets.remove(target)
+        target.status = TrackStatus.LOST
+        target.visible_fraction = 0.0
+        self._registration.remove(target.id)
+
+    def _prune(self, now: int) -> None:
+        """Drop new objects that were not confirmed in time."""
+        for target in list(self._targets):
+            stale = now - target.born > self.config.tentative_timeout * NANOSECONDS
+            if target.status is TrackStatus.TENTATIVE and stale:
+                self._lose(target)
+
+    # -------------------------------------------------------------------------------------------------- late detections
+
+    def _take_detections(self, hypotheses: Sequence[PoseHypothesis]) -> None:
+        """Match detections to targets at the stamp of their image; what matches none may be a new object."""
+        for stamp in sorted({h.stamp for h in hypotheses}):
+            view = next((v for v in self._views if v.stamp == stamp), None)
+            if view is None:
+                continue
+            T_camera_map = inverse(view.T_map_camera)
+            groups = group_by_detection([h for h in hypotheses if h.stamp == stamp])
+            living = [t for t in self._targets if t.alive]
+            poses = [T_camera_map @ t.filter.pose_at(stamp) for t in living]
+            costs = np.full((len(groups), len(living)), np.inf)
+            for i, group in enumerate(groups):
+                for j, target in enumerate(living):
+                    if target.model.name == group[0].class_name:
+                        costs[i, j] = association_cost(group[0], poses[j], target.model.diameter, view.intrinsics)
+            pairs = dict(assign(costs))
+            for i, group in enumerate(groups):
+                if i in pairs:
+                    self._confirm(living[pairs[i]], poses[pairs[i]], group, view)
+                else:
+                    self._bear(group, view)
+
+    def _confirm(self, target: _Target, T_camera_object: Float64, group: list[PoseHypothesis], view: _View) -> None:
+        """Take a detection of a tracked object: fuse it, or let it contest an orientation that it disagrees with."""
+        target.detections += 1
+        target.score = min(0.99, target.score + 0.1)
+        apart = [rotation_apart(h.T_camera_object, T_camera_object, target.model) for h in group]
+        nearest = group[int(np.argmin(apart))]
+        if min(apart) <= self.config.disagreement:
+            target.disagreements = 0
+            self._fuse_late(target, T_camera_object, nearest, view)
+            return
+        target.disagreements += 1
+        if target.disagreements >= 2 or target.status is TrackStatus.TENTATIVE or view.stamp > target.last_seen:
+            self._contest(target, T_camera_object, group, view)
+
+    def _fuse_late(self, target: _Target, T_camera_object: Float64, h: PoseHypothesis, view: _View) -> None:
+        """Fuse a detection's pose at its own stamp, unless it lies outside of its own error bounds."""
+        T = nearest_equivalent(h.T_camera_object, T_camera_object, target.model)
+        R = view.T_map_camera[:3, :3]
+        error = T[:3, 3] - T_camera_object[:3, 3]
+        if float(error @ np.linalg.solve(h.covariance[:3, :3], error)) < 12.0:
+            target.filter.update(
+                Measurement(view.stamp, view.T_map_camera @ T, rotate_covariance(R, h.covariance), np.zeros((6, 6)))
+            )
+
+    def _contest(self, target: _Target, T_camera_object: Float64, group: list[PoseHypothesis], view: _View) -> None:
+        """Let a detection's pose and the track's compete for the better fit to the depth image of its stamp."""
+        model = self._tracked[target.model.name]
+        challenger = self._prober.best(group, model, view.depth, view.intrinsics)
+        if challenger is None:
+            return
+        holder = self._prober.judge(T_camera_object, model, view.depth, view.intrinsics)
+        if holder is not None and cost(holder) < 1.3 * cost(challenger):
+            target.disagreements = 0
+            return
+        state = self._follow_up(target.model, challenger, view)
+        if state is not None:
+            target.filter, target.last_seen, target.disagreements = state, state.state.stamp, 0
+
+    def _bear(self, group: list[PoseHypothesis], view: _View) -> None:
+        """Make a detection that no track explains a track, if a registered hypothesis is believable."""
+        model = self._models[group[0].class_name]
+        result = self._prober.best(group, self._tracked[model.name], view.depth, view.intrinsics)
+        if result is None:
+            return
+        T_map_object = view.T_map_camera @ result.T_camera_object
+        for other in self._targets:
+            T_other = other.filter.pose_at(view.stamp)
+            if not other.alive or box_overlap(T_map_object, model.extents, T_other, other.model.extents) < 0.2:
+                continue
+            if other.model is model:
+                self._confirm(other, inverse(view.T_map_camera) @ T_other, group, view)
+                return
+            if not self._outdoes(result, other, T_other, view):
+                return
+            self._lose(other)
+        followed = self._follow_up(model, result, view)
+        if followed is None:
+            return
+        target = self._known_before(model, followed) or self._newcomer(model, followed, view)
+        target.filter, target.last_seen = followed, followed.state.stamp
+        target.residual, target.missing_since = result.residual, None
+        self._registration.add(target.id, self._tracked[model.name])
+
+    def _outdoes(self, result: RegistrationResult, other: _Target, T_other: Float64, view: _View) -> bool:
+        """Whether a candidate of another class explains a place clearly better than the track that holds it."""
+        T = inverse(view.T_map_camera) @ T_other
+        holder = self._prober.judge(T, self._tracked[other.model.name], view.depth, view.intrinsics)
+        if holder is None:
+            return False
+        established = 3.0 if other.status is not TrackStatus.TENTATIVE else 1.5
+        return cost(result) * established < cost(holder)
+
+    def _newcomer(self, model: ObjectModel, followed: PoseFilter, view: _View) -> _Target:
+        target = _Target(self._next_id, model, followed, born=view.stamp)
+        self._next_id += 1
+        self._targets.append(target)
+        return target
+
+    def _known_before(self, model: ObjectModel, followed: PoseFilter) -> _Target | None:
+        """The target that a reappearing object is: a lost one, or one that was being moved when last seen."""
+        lost = [t for t in self._targets if not t.alive and t.model is model]
+        if lost:
+            return self._revive(max(lost, key=lambda t: t.last_seen))
+        for target in self._targets:
+            unseen = target.status in (TrackStatus.OCCLUDED, TrackStatus.OUT_OF_VIEW)
+            age = (followed.state.stamp - target.last_seen) / NANOSECONDS
+            if target.model is not model or not unseen or not target.moved_when_seen:
+                continue
+            distance = np.linalg.norm(followed.state.T_map_object[:3, 3] - target.filter.state.T_map_object[:3, 3])
+            if age < self.config.same_object_memory and distance < 0.15 + self.config.same_object_speed * age:
+                self._registration.remove(target.id)
+                return self._revive(target)
+        return None
+
+    @staticmethod
+    def _revive(target: _Target) -> _Target:
+        target.status = TrackStatus.CONFIRMED
+        target.score = max(target.score, 0.6)
+        return target
+
+    def _follow_up(self, model: ObjectModel, result: RegistrationResult, view: _View) -> PoseFilter | None:
+        """Replay a registered candidate through the depth images since its own; None if it is lost on the way."""
+        tracked = self._tracked[model.name]
+        R = view.T_map_camera[:3, :3]
+        covariance = rotate_covariance(R, result.covariance)
+        state = PoseFilter(view.stamp, view.T_map_camera @ result.T_camera_object, covariance, self.config.filter)
+        last = view.stamp
+        for later in self._views:
+            if later.stamp <= view.stamp:
+                continue
+            T = inverse(later.T_map_camera) @ state.predict(later.stamp).T_map_object
+            followed = self._prober.follow(T, tracked, later.depth, later.intrinsics)
+            if followed is not None and believable(followed, self.config.fit):
+                state.update(self._measurement(later, followed, last))
+                last = later.stamp
+            else:
+                state.skip(later.stamp)
+        newest = self._views[-1].stamp
+        return state if newest - last <= 0.15 * NANOSECONDS else None
+
+    # ---------------------------------------------------------------------------------------------------------- results
+
+    def _tracks(self, view: _View) -> tuple[Track, ...]:
+        T_camera_map = inverse(view.T_map_camera)
+        tracks = []
+        for t in self._targets:
+            state = t.filter.predict(view.stamp)
+            seen = t.last_seen == view.stamp
+            covariance = state.covariance[:6, :6] + camera_error_at(view, state.T_map_object)
+            tracks.append(
+                Track(
+                    id=t.id,
+                    class_name=t.model.name,
+                    status=t.status,
+                    stamp=view.stamp,
+                    T_map_object=state.T_map_object,
+                    covariance=covariance,
+                    T_camera_object=T_camera_map @ state.T_map_object,
+                    velocity=state.velocity,
+                    last_seen=t.last_seen,
+                    visible_fraction=t.visible_fraction,
+                    moving=state.moving and seen,
+                    residual=t.residual,
+                    score=t.score if t.alive else 0.0,
+                )
+            )
+        return tuple(tracks)
+
+
+def tracked_model(model: ObjectModel) -> TrackedModel:
+    """What the registration needs of an object model."""
+    corners = model.keypoints[:8]
+    return TrackedModel(
+        TriangleMesh(model.mesh.vertices, model.mesh.faces), corners, 0.5 * float(np.linalg.norm(model.extents))
+    )
+
+
+def camera_error_at(view: _View, T_map_object: Float64) -> Float64:
+    """(6, 6) covariance that an uncertain camera pose adds to an object's pose in the map, lever arm included."""
+    J = np.eye(6)
+    J[:3, 3:] = -skew(T_map_object[:3, 3] - view.T_map_camera[:3, 3])
+    return J @ view.covariance @ J.T
+
+
+def _share_in_image(model: ObjectModel, T_camera_object: Float64, intrinsics: CameraIntrinsics) -> float:
+    """Share of the projected box's bounding rectangle that lies inside the image."""
+    p = model.keypoints[:8] @ T_camera_object[:3, :3].T + T_camera_object[:3, 3]
+    if p[:, 2].min() < 0.05:
+        return 0.0
+    u = intrinsics.fx * p[:, 0] / p[:, 2] + intrinsics.cx
+    v = intrinsics.fy * p[:, 1] / p[:, 2] + intrinsics.cy
+    width, height = float(np.ptp(u)), float(np.ptp(v))
+    inside_u = max(0.0, min(float(u.max()), intrinsics.width - 0.5) - max(float(u.min()), -0.5))
+    inside_v = max(0.0, min(float(v.max()), intrinsics.height - 0.5) - max(float(v.min()), -0.5))
+    return inside_u * inside_v / max(width * height, 1e-9)
