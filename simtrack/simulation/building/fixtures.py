@@ -144,11 +144,11 @@ def _leaf(length: float, half_width: float) -> Mesh:
 
 def trash_bin(diameter: float = 0.3, height: float = 0.35, color: Color = BLACK) -> Furniture:
     """Round waste-paper bin, hollow."""
-    import manifold3d
+    from manifold3d import Manifold
 
     r, wall = diameter / 2, 0.005
-    outer = manifold3d.Manifold.cylinder(height, 0.85 * r, r, 18)
-    solid = outer - manifold3d.Manifold.cylinder(height, 0.85 * r - wall, r - wall, 18).translate((0.0, 0.0, wall))
+    outer = Manifold.cylinder(height, 0.85 * r, r, 18)
+    solid = outer - Manifold.cylinder(height, 0.85 * r - wall, r - wall, 18).translate((0.0, 0.0, wall))
     data = solid.to_mesh64()
     a = Assembly("trash-bin")
     a.mesh(painted(Mesh(np.asarray(data.vert_properties)[:, :3], np.asarray(data.tri_verts)), color))

@@ -163,17 +163,17 @@ def shelf(
 
 def bin_box(depth: float = 0.4, width: float = 0.3, height: float = 0.25, color: Color = BLUE) -> Furniture:
     """Open storage bin with tapered walls and a rim, hollowed out by a boolean difference."""
-    import manifold3d
+    from manifold3d import CrossSection, Manifold
 
-    def frustum(x: float, y: float, low: float, high: float, flare: float) -> manifold3d.Manifold:
-        section = manifold3d.CrossSection.square((x, y), True)
+    def frustum(x: float, y: float, low: float, high: float, flare: float) -> Manifold:
+        section = CrossSection.square((x, y), True)
         return section.extrude(high - low, 0, 0.0, (flare, flare)).translate((0.0, 0.0, low))
 
     wall, flare = 0.006, 1.12
     x, y = depth / flare, width / flare
-    outer = frustum(x, y, 0.0, height, flare) + manifold3d.Manifold.cube(
-        (depth + 0.02, width + 0.02, 0.02), True
-    ).translate((0.0, 0.0, height - 0.01))
+    outer = frustum(x, y, 0.0, height, flare) + Manifold.cube((depth + 0.02, width + 0.02, 0.02), True).translate(
+        (0.0, 0.0, height - 0.01)
+    )
     solid = outer - frustum(x - 2 * wall, y - 2 * wall, wall, height + 0.01, flare)
     data = solid.to_mesh64()
     a = Assembly("bin")
