@@ -1,0 +1,286 @@
+"""The report's figures, drawn with matplotlib as SVG that follows the page's theme and width.
+
+Each figure is drawn twice, for wide and for narrow pages, with type of the same size; CSS shows the one that fits.
+"""
+
+import io
+import re
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from simtrack.contracts import NANOSECONDS, Float64, MapEntity
+from simtrack.evaluation.record import Interval, LidarPicture, RunRecord
+from simtrack.evaluation.tracking import ObjectFrame
+from simtrack.report.colors import ACCENT, BAD, CSS_VARIABLES, FACE, GRID, INK, MUTED, PALETTE, UNKNOWN
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDE, NARROW = 11.0, 4.2
+"""Inches."""
+MAX_SAMPLES = 400
+"""Points of a curve in the page."""
+_STYLE: dict[Any, Any] = {
+    "font.size": 8.5, "axes.titlesize": 8.5, "axes.labelsize": 8.5, "xtick.labelsize": 8, "ytick.labelsize": 8,
+    "legend.fontsize": 8, "svg.fonttype": "none", "svg.hashsalt": "simtrack", "text.color": INK, "axes.labelcolor":
+    MUTED, "xtick.color": MUTED, "ytick.color": MUTED, "axes.edgecolor": GRID, "axes.spines.top": False,
+    "axes.spines.right": False, "grid.color": GRID, "grid.linewidth": 0.6, "axes.facecolor": "none",
+    "figure.facecolor": "none", "legend.frameon": False, "legend.labelcolor": INK, "lines.linewidth": 1.3,
+    "lines.solid_capstyle": "round", "axes.axisbelow": True,
+}  # fmt: skip
+
+
+def both_widths(draw: "Callable[[Figure, float], None]", heights: tuple[float, float], description: str) -> str:
+    """HTML of a figure in two widths; `draw` fills a figure of the width (inches) that it is told."""
+    wide, narrow = (_svg(draw, width, h) for width, h in zip((WIDE, NARROW), heights, strict=True))
+    return (
+        f'<div class="figure wide" role="img" aria-label="{description}">{wide}</div>'
+        f'<div class="figure narrow" role="img" aria-label="{description}">{narrow}</div>'
+    )
+
+
+def _svg(draw: "Callable[[Figure, float], None]", width: float, height: float) -> str:
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        draw(figure, width)
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, dpi=144)
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r"(<svg[^>]*?) height=\"[^\"]*\"", r"\1", text, count=1)
+    text = re.sub(r"(<svg[^>]*?) width=\"[^\"]*\"", r"\1", text, count=1)
+    text = re.sub(r"'DejaVu Sans'(, [^;\"]*)?", "inherit", text)
+    for color, variable in CSS_VARIABLES.items():
+        text = text.replace(color, variable)
+    return text
+
+
+# ----------------------------------------------------------------------------------------------------------- trajectory
+
+
+def floor_plan(record: RunRecord, colors: Mapping[str, str]) -> str:
+    """The robot's true and believed path among the surveyed furniture, and the objects at the end."""
+    path = np.array([T[:2, 3] for T in record.true]) if len(record.true) else np.zeros((0, 2))
+    believed = np.array([T[:2, 3] for T in record.estimated]) if len(record.estimated) else np.zeros((0, 2))
+    last = _last_frames(record.object_frames)
+
+    def draw(figure: "Figure", width: float) -> None:
+        axes = figure.subplots()
+        for room in record.static_map.rooms:
+            axes.fill(*room.polygon.T, color=FACE, zorder=0)
+        for entity in record.static_map.entities:
+            _footprint(axes, entity, names=width == WIDE and len(record.static_map.entities) < 60)
+        axes.plot(*path.T, color=INK, linewidth=2.4, label="true path")
+        axes.plot(*believed.T, color=ACCENT, linewidth=1.1, linestyle=(0, (3, 2)), label="believed path")
+        if len(path):
+            axes.plot(*path[0], marker="o", color=INK, markersize=5)
+            axes.plot(*path[-1], marker="s", color=INK, markersize=5)
+        for thing in last:
+            if thing.track is not None:
+                x, y = thing.track.T_map_object[:2, 3]
+                axes.plot(x, y, marker="o", markersize=4.5, color=colors[thing.class_name], markeredgecolor=FACE)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel("x in m")
+        axes.set_ylabel("y in m")
+        axes.grid(True)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.09 if width == WIDE else 1.14), ncols=2)
+
+    shape = _aspect(record)
+    return both_widths(draw, (min(7.0, max(4.5, WIDE * shape)), min(5.0, max(3.2, NARROW * shape))), "floor plan")
+
+
+def _footprint(axes: "Axes", entity: MapEntity, names: bool) -> None:
+    if entity.semantic_class in ("floor", "ceiling", "lamp"):
+        return
+    half = entity.extents / 2
+    corners = np.array([[-half[0], -half[1]], [half[0], -half[1]], [half[0], half[1]], [-half[0], half[1]]])
+    outline = corners @ entity.T_map_entity[:2, :2].T + entity.T_map_entity[:2, 3]
+    wall = entity.semantic_class == "wall"
+    axes.fill(
+        *outline.T, facecolor=MUTED if wall else GRID, edgecolor=MUTED, linewidth=0.5, alpha=0.9 if wall else 0.55
+    )
+    if names and not wall and min(entity.extents[:2]) > 0.3 and "/" not in entity.name:
+        axes.annotate(entity.name, tuple(entity.T_map_entity[:2, 3]), ha="center", va="center", fontsize=7, color=MUTED)
+
+
+def _aspect(record: RunRecord) -> float:
+    entities = [e for e in record.static_map.entities if e.semantic_class not in ("floor", "ceiling")]
+    centres = [e.T_map_entity[:2, 3] for e in entities] + [T[:2, 3] for T in record.true]
+    if len(centres) < 2:
+        return 0.6
+    size = np.ptp(np.array(centres), axis=0)
+    return float(np.clip((size[1] + 1) / (size[0] + 1), 0.3, 1.2))
+
+
+def pose_error(record: RunRecord, translation: Float64, rotation: Float64) -> str:
+    """Translation and rotation error of the robot's pose over time."""
+    seconds = _seconds(record, np.asarray(record.stamps))
+
+    def draw(figure: "Figure", width: float) -> None:
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        for axes, errors, label in ((upper, 1e3 * translation, "mm"), (lower, np.degrees(rotation), "deg")):
+            axes.plot(*_thin(seconds, errors), color=ACCENT)
+            axes.set_ylim(bottom=0)
+            axes.set_ylabel(label)
+            axes.grid(True, axis="y")
+        lower.set_xlabel("time in s")
+        lower.margins(x=0.01)
+
+    return both_widths(draw, (2.6, 2.6), "error of the robot's pose over time")
+
+
+# -------------------------------------------------------------------------------------------------------------- objects
+
+
+def object_errors(record: RunRecord, colors: Mapping[str, str]) -> str:
+    """Translation error of every object over time; hidden, moving and untracked times shaded."""
+    series: dict[str, list[ObjectFrame]] = {}
+    for frame in record.object_frames:
+        series.setdefault(frame.name, []).append(frame)
+
+    def draw(figure: "Figure", width: float) -> None:
+        rows = figure.subplots(len(series), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, (name, frames) in zip(rows, series.items(), strict=True):
+            _object_row(axes, record, name, frames, colors[frames[0].class_name])
+            for stamp, switched in record.switches:
+                if switched == name:
+                    axes.axvline(_seconds(record, stamp), color=BAD, linewidth=1.2, linestyle=":")
+        rows[-1].set_xlabel("time in s")
+        rows[-1].margins(x=0.01)
+        figure.supylabel("translation error in mm", fontsize=8.5, color=MUTED)
+
+    height = 0.62 * len(series) + 0.5
+    return both_widths(draw, (height, height * 1.1), "error over time of every object") if series else ""
+
+
+def _object_row(axes: "Axes", record: RunRecord, name: str, frames: Sequence[ObjectFrame], color: str) -> None:
+    seconds = _seconds(record, np.array([f.stamp for f in frames]))
+    seen = np.array([f.scored for f in frames])
+    tracked = np.array([f.track is not None for f in frames])
+    moving = np.array([f.moving for f in frames])
+    errors = np.array([1e3 * f.translation_error if f.track is not None else np.nan for f in frames])
+    for flags, shade, alpha, z in ((~seen, GRID, 0.75, 0), (moving, ACCENT, 0.16, 1), (seen & ~tracked, BAD, 0.35, 2)):
+        for start, end in _runs(flags):
+            axes.axvspan(
+                seconds[start], seconds[min(end, len(seconds) - 1)], color=shade, alpha=alpha, linewidth=0, zorder=z
+            )
+    axes.plot(*_thin(seconds, np.where(seen, np.nan, errors)), color=color, linewidth=0.8, alpha=0.55)
+    axes.plot(*_thin(seconds, np.where(seen, errors, np.nan)), color=color)
+    axes.set_yscale("log")
+    axes.set_ylim(0.1, 150)
+    axes.set_yticks([0.1, 1, 10, 100], ["0.1", "1", "10", ""], minor=False)
+    axes.minorticks_off()
+    axes.grid(True, axis="y")
+    median = np.median(errors[seen & tracked]) if (seen & tracked).any() else np.nan
+    text = f"{name}   median {median:.1f} mm" if np.isfinite(median) else f"{name}   never tracked in view"
+    axes.set_title(text, loc="left", pad=2, color=INK)
+
+
+# ---------------------------------------------------------------------------------------------- the unknown, relations
+
+
+def lidar_view(record: RunRecord, picture: LidarPicture) -> str:
+    """A scan from above: red is what nothing explains."""
+    close = np.abs(picture.points[:, :2] - picture.T_map_base[:2, 3]).max(axis=1) < 12.0
+    known, unknown = (picture.points[close & flags] for flags in (~picture.unknown, picture.unknown))
+
+    def draw(figure: "Figure", width: float) -> None:
+        axes = figure.subplots()
+        axes.scatter(known[:, 0], known[:, 1], s=0.7, color="#8a94a0", linewidths=0, rasterized=True)
+        axes.scatter(unknown[:, 0], unknown[:, 1], s=2.2, color=UNKNOWN, linewidths=0, rasterized=True)
+        x, y = picture.T_map_base[:2, 3]
+        forward = picture.T_map_base[:2, 0] * 0.5
+        axes.annotate("", (x + forward[0], y + forward[1]), (x, y), arrowprops={"arrowstyle": "-|>", "color": ACCENT})
+        axes.plot(x, y, marker="o", color=ACCENT, markersize=6)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel("x in m")
+        axes.set_ylabel("y in m")
+
+    return both_widths(draw, (6.2, 4.0), "lidar scan from above")
+
+
+def relations(record: RunRecord, chosen: Sequence[Interval]) -> str:
+    """When relations held, one row a relation."""
+    rows: dict[str, list[Interval]] = {}
+    for interval in chosen:
+        r = interval.relation
+        rows.setdefault(f"{r.subject} {r.name} {r.reference}", []).append(interval)
+    kinds = sorted({i.relation.name for i in chosen})
+    shade = {kind: PALETTE[k % len(PALETTE)] for k, kind in enumerate(kinds)}
+
+    def draw(figure: "Figure", width: float) -> None:
+        axes = figure.subplots()
+        least = (record.end - record.start) / NANOSECONDS / 300
+        for k, intervals in enumerate(rows.values()):
+            bars = [(float(_seconds(record, i.start)), max((i.end - i.start) / NANOSECONDS, least)) for i in intervals]
+            axes.broken_barh(bars, (k - 0.36, 0.72), facecolors=shade[intervals[0].relation.name], linewidth=0)
+        axes.set_yticks(range(len(rows)), list(rows), color=INK)
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.set_xlim(0, (record.end - record.start) / NANOSECONDS)
+        axes.tick_params(axis="y", length=0)
+        axes.set_xlabel("time in s")
+        axes.grid(True, axis="x")
+
+    height = 0.21 * len(rows) + 0.5
+    return both_widths(draw, (height, height), "relations over time") if rows else ""
+
+
+# ---------------------------------------------------------------------------------------------------------------- speed
+
+
+def stage_times(record: RunRecord) -> str:
+    """Median time of each stage, with whiskers to the 95th percentile."""
+    stages = {name: 1e3 * np.asarray(s) for name, s in record.stage_seconds.items() if len(s)}
+    names = sorted(stages, key=lambda name: -float(np.median(stages[name])))
+
+    def draw(figure: "Figure", width: float) -> None:
+        axes = figure.subplots()
+        for k, name in enumerate(names):
+            median, high = np.median(stages[name]), np.quantile(stages[name], 0.95)
+            axes.barh(k, median, height=0.62, color=ACCENT, linewidth=0)
+            axes.plot([median, high], [k, k], color=MUTED, linewidth=1.4)
+            axes.annotate(f" {median:.1f} ms", (high, k), va="center", fontsize=8, color=INK)
+        axes.set_yticks(range(len(names)), names, color=INK)
+        axes.set_ylim(len(names) - 0.4, -0.6)
+        axes.margins(x=0.14)
+        axes.tick_params(axis="y", length=0)
+        axes.set_xlabel("time in ms: bar to the median, line to the 95th percentile")
+        axes.grid(True, axis="x")
+
+    height = 0.26 * len(names) + 0.6
+    return both_widths(draw, (height, height), "time per stage") if names else ""
+
+
+# -------------------------------------------------------------------------------------------------------------- helpers
+
+
+def _seconds(record: RunRecord, stamps: np.ndarray | int) -> np.ndarray:
+    return (np.asarray(stamps) - record.start) / NANOSECONDS
+
+
+def _thin(x: Float64, y: Float64) -> tuple[Float64, Float64]:
+    """A curve of at most `MAX_SAMPLES` points that keeps each bin's largest value, so that no peak is lost."""
+    if len(x) <= MAX_SAMPLES:
+        return x, y
+    edges = np.linspace(0, len(x), MAX_SAMPLES + 1).astype(int)
+    low = np.where(np.isnan(y), -np.inf, y)
+    keep = np.array([a + int(np.argmax(low[a:b])) for a, b in pairwise(edges)])
+    return x[keep], y[keep]
+
+
+def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Half-open ranges in which flags are set."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _last_frames(frames: Sequence[ObjectFrame]) -> list[ObjectFrame]:
+    return list({frame.name: frame for frame in frames}.values())
