@@ -1,0 +1,84 @@
+"""When which relation held."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
+
+from simtrack.contracts import Relation
+
+
+class Interval(NamedTuple):
+    """Time during which a relation held: half-open, ``begin <= stamp < end``."""
+
+    begin: int
+    """Nanoseconds: stamp of the first update in which the relation held."""
+    end: int | None
+    """Nanoseconds: stamp of the first update in which it held no more; None while it holds."""
+
+    def covers(self, stamp: int) -> bool:
+        """Whether the relation held at `stamp`, nanoseconds."""
+        return self.begin <= stamp and (self.end is None or stamp < self.end)
+
+
+class Event(NamedTuple):
+    """A relation that began or ceased to hold."""
+
+    stamp: int
+    relation: Relation
+    begins: bool
+
+
+class History:
+    """For each relation its intervals, in order and disjoint, and all changes in order of time."""
+
+    def __init__(self, intervals: Mapping[Relation, Iterable[Interval]] | None = None) -> None:
+        self._intervals: dict[Relation, list[Interval]] = {}
+        self._current: set[Relation] = set()
+        self._frozen: frozenset[Relation] | None = None
+        self.events: list[Event] = []
+        for relation, spans in (intervals or {}).items():
+            self._intervals[relation] = list(spans)
+            for begin, end in self._intervals[relation]:
+                self.events.append(Event(begin, relation, True))
+                if end is None:
+                    self._current.add(relation)
+                else:
+                    self.events.append(Event(end, relation, False))
+        self.events.sort(key=lambda event: event.stamp)
+
+    @property
+    def current(self) -> frozenset[Relation]:
+        """Relations that hold now."""
+        if self._frozen is None:
+            self._frozen = frozenset(self._current)
+        return self._frozen
+
+    def begin(self, stamp: int, relation: Relation) -> None:
+        """Note that a relation holds from `stamp`, nanoseconds; no effect if it holds already."""
+        if relation not in self._current:
+            self._current.add(relation)
+            self._frozen = None
+            self._intervals.setdefault(relation, []).append(Interval(stamp, None))
+            self.events.append(Event(stamp, relation, True))
+
+    def end(self, stamp: int, relation: Relation) -> None:
+        """Note that a relation holds no more from `stamp`, nanoseconds; no effect if it does not hold."""
+        if relation in self._current:
+            self._current.remove(relation)
+            self._frozen = None
+            spans = self._intervals[relation]
+            spans[-1] = Interval(spans[-1].begin, stamp)
+            self.events.append(Event(stamp, relation, False))
+
+    def intervals(self, relation: Relation) -> tuple[Interval, ...]:
+        """Intervals during which a relation held, earliest first; empty if it never did."""
+        return tuple(self._intervals.get(relation, ()))
+
+    def at(self, stamp: int) -> frozenset[Relation]:
+        """Relations that held at `stamp`, nanoseconds."""
+        return frozenset(r for r, spans in self._intervals.items() if any(span.covers(stamp) for span in spans))
+
+    def __iter__(self) -> Iterator[tuple[Relation, tuple[Interval, ...]]]:
+        return ((relation, tuple(spans)) for relation, spans in self._intervals.items())
+
+    def __len__(self) -> int:
+        return len(self._intervals)

@@ -1,0 +1,355 @@
+"""Spatial relations between bodies, with the semantics of SEMAP, as pure functions of shapes and poses.
+
+SEMAP: H. Deeken et al., "SEMAP - a semantic environment mapping framework", ECMR 2015, as used by the tracking paper,
+section III.D. Every body has its own frame: x points to its front, y to its left, z to its top. For each of the six
+directions a reference has two regions: the half-space beyond the face of its box, and the projection, a box of the same
+cross-section that starts at the face and is 3.5 times as long as the box. Each can be asked strictly (the region contains
+the target's box) or relaxed (it meets it). Where a viewer is given, the reference's frame is replaced by one that looks
+from the viewer to the reference: in front of is towards the viewer, left is the viewer's left.
+
+A margin is the signed distance of a pair from the boundary of a relation, in metres: the relation holds where it is >= 0.
+docs/scene_graph.md shows every definition.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from simtrack.contracts import Float64, Room
+from simtrack.errors import InvalidValueError, UnknownNameError
+from simtrack.geometry.boxes import OrientedBox
+from simtrack.perception.scene_graph import kernels
+from simtrack.perception.scene_graph.kernels import Parameters, World
+from simtrack.perception.scene_graph.shapes import HeightField, Shape
+
+RELATIONS = (
+    "on",
+    "in",
+    "above",
+    "below",
+    "left-of",
+    "right-of",
+    "in-front-of",
+    "behind",
+    "near",
+    "touching",
+    "intersects",
+)
+"""Names in the order of the last axis of `relation_margins`."""
+DIRECTIONS = RELATIONS[2:8]
+SYMMETRIC = RELATIONS[8:]
+CONVERSE = {"above": "below", "left-of": "right-of", "in-front-of": "behind"}
+"""Opposite directions. Not inverse: with tilted or turned objects `a left-of b` does not imply `b right-of a`."""
+
+
+@dataclass(frozen=True, slots=True)
+class RelationConfig:
+    """Thresholds of the relations and which variant of the directions is kept live."""
+
+    projection: bool = True
+    """Directions by projection (else half-space)."""
+    strict: bool = False
+    """Regions contain the target (else meet it)."""
+    projection_factor: float = 3.5
+    """Length of a projection in lengths of the box."""
+    on_distance: float = 0.02
+    """Metres: largest vertical gap between a body and what it rests on. Twice the survey's error and the tracker's."""
+    near_range: float = 0.25
+    """Metres between the boxes."""
+    touch_distance: float = 0.01
+    """Metres between the boxes."""
+    intersection_depth: float = 0.005
+    """Metres of penetration of the boxes from which bodies count as intersecting; pose errors stay below."""
+    meet_depth: float = 0.01
+    """Metres of penetration from which a region meets a target that it does not contain: a bench is not to the left of
+    what stands on it because pose errors let their surfaces cross."""
+    enter_margin: float = 0.0
+    """Metres: margin at which a relation begins to hold."""
+    leave_margin: float = 0.002
+    """Metres: a relation that holds ends when its margin falls below minus this (hysteresis against flicker)."""
+    container_classes: frozenset[str] = frozenset({"bin", "box", "cabinet", "container", "cupboard", "rack", "shelf"})
+    """Semantic classes of the static map that are hollow. Tracked models are recognised by their mesh."""
+    layout_classes: frozenset[str] = frozenset({"ceiling", "door", "floor", "wall", "window"})
+    """Semantic classes that carry, touch and are near things, but are no landmarks: no directions, no `in`."""
+
+    def __post_init__(self) -> None:
+        for name in ("projection_factor", "on_distance", "near_range", "touch_distance"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InvalidValueError(f"RelationConfig.{name}", getattr(self, name), "a positive finite number")
+        for name in ("intersection_depth", "meet_depth", "enter_margin", "leave_margin"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise InvalidValueError(f"RelationConfig.{name}", getattr(self, name), "a finite number >= 0, metres")
+
+    def parameters(self, *, strict: bool | None = None, projection: bool | None = None) -> Parameters:
+        """The thresholds for compiled code, optionally of another variant than the live one."""
+        return Parameters(
+            float(self.projection_factor),
+            float(self.on_distance),
+            float(self.near_range),
+            float(self.touch_distance),
+            float(self.intersection_depth),
+            float(self.meet_depth),
+            float(self.enter_margin),
+            float(self.leave_margin),
+            bool(self.strict if strict is None else strict),
+            bool(self.projection if projection is None else projection),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A shape at a pose."""
+
+    shape: Shape
+    T_map: Float64
+    """(4, 4), origin in the centre of the box."""
+
+    @property
+    def box(self) -> OrientedBox:
+        """The body's oriented box."""
+        return OrientedBox(self.T_map, self.shape.extents)
+
+
+class BodyArrays:
+    """Bodies in the arrays that the kernels read; rows (slots) are reused, arrays grow by doubling."""
+
+    def __init__(self, shapes: Mapping[str, Shape], config: RelationConfig, capacity: int = 16) -> None:
+        self._config = config
+        self._rows: dict[str, tuple[list[int], tuple[int, int]]] = {}
+        self.shapes: dict[str, Shape] = {}
+        self._fields: list[HeightField] = []
+        self._stale = False
+        self._free = list(range(capacity - 1, -1, -1))
+        self.alive = np.zeros(capacity, dtype=np.bool_)
+        self.world = _empty_world(capacity)
+        for name, shape in shapes.items():
+            self.declare(name, shape)
+
+    def declare(self, kind: str, shape: Shape) -> None:
+        """Make a shape known under a name."""
+        first = len(self._fields)
+        self._fields += [*shape.fields, *shape.supports]
+        self._rows[kind] = (list(range(first, first + 6)), (first + 6, len(shape.supports)))
+        self.shapes[kind] = shape
+        self._stale = True
+
+    def add(self, kind: str, T_map: Float64) -> int:
+        """Put a body of a declared shape into a free slot."""
+        self._refresh_fields()
+        if not self._free:
+            self._grow()
+        slot = self._free.pop()
+        shape, world = self.shapes[kind], self.world
+        world.halves[slot] = 0.5 * np.asarray(shape.extents)
+        world.radii[slot] = np.linalg.norm(world.halves[slot])
+        world.reach[slot] = _reach(shape, self._config)
+        world.layout[slot] = shape.layout
+        world.interior_centres[slot] = 0.0 if shape.interior is None else shape.interior.centre
+        world.interior_halves[slot] = 0.0 if shape.interior is None else 0.5 * shape.interior.extents
+        world.fields[slot], world.supports[slot] = self._rows[kind]
+        self.alive[slot] = True
+        self.set_poses(np.array([slot]), np.asarray(T_map, dtype=float)[None])
+        return slot
+
+    def set_poses(self, slots: np.ndarray, T_map: Float64) -> None:
+        """Move slots (S,) to poses (S, 4, 4)."""
+        self.world.centres[slots] = T_map[:, :3, 3]
+        self.world.rotations[slots] = T_map[:, :3, :3]
+
+    def remove(self, slot: int) -> None:
+        """Free a slot."""
+        self.alive[slot] = False
+        self._free.append(slot)
+
+    def _grow(self) -> None:
+        old, size = self.world, len(self.alive)
+        world = _empty_world(2 * size)
+        for name in _PER_SLOT:
+            getattr(world, name)[:size] = getattr(old, name)
+        self.world = world._replace(**{name: getattr(old, name) for name in World._fields if name not in _PER_SLOT})
+        self.alive = np.concatenate([self.alive, np.zeros(size, dtype=np.bool_)])
+        self._free = list(range(2 * size - 1, size - 1, -1))
+
+    def _refresh_fields(self) -> None:
+        if not self._stale:
+            return
+        sizes = [field.heights.size for field in self._fields]
+        starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+        shapes = [(*f.heights.shape, s) for f, s in zip(self._fields, starts, strict=True)]
+        self.world = self.world._replace(
+            field_rotations=np.array([f.T_entity_field[:3, :3] for f in self._fields], dtype=float),
+            field_origins=np.array([f.T_entity_field[:3, 3] for f in self._fields], dtype=float),
+            field_sizes=np.array([f.size for f in self._fields], dtype=float),
+            field_shapes=np.array(shapes, dtype=np.int32),
+            heights=np.concatenate([np.ascontiguousarray(f.heights, dtype=float).ravel() for f in self._fields]),
+        )
+        self._stale = False
+
+
+def relation_margins(
+    bodies: Sequence[Body], config: RelationConfig, *, strict: bool | None = None, projection: bool | None = None
+) -> Float64:
+    """(N, N, 11) margins in metres, ``[subject, reference, relation]`` in the order of `RELATIONS`; diagonal -inf."""
+    arrays = BodyArrays({}, config, capacity=max(1, len(bodies)))
+    kinds: dict[int, str] = {}
+    for body in bodies:
+        if id(body.shape) not in kinds:
+            kinds[id(body.shape)] = str(len(kinds))
+            arrays.declare(kinds[id(body.shape)], body.shape)
+    for body in bodies:
+        arrays.add(kinds[id(body.shape)], body.T_map)
+    n = len(bodies)
+    pairs = np.stack(np.divmod(np.arange(n * n), max(n, 1)), axis=1)
+    parameters = config.parameters(strict=strict, projection=projection)
+    return kernels.margin_table(arrays.world, pairs, parameters).reshape(n, n, kernels.COUNT)
+
+
+def relation_margin(
+    subject: Body,
+    name: str,
+    reference: Body,
+    config: RelationConfig,
+    *,
+    strict: bool | None = None,
+    projection: bool | None = None,
+    viewer: Float64 | None = None,
+) -> float:
+    """Margin of one relation in metres, >= 0 where it holds.
+
+    Args:
+        subject: what the relation is said of.
+        name: one of `RELATIONS`.
+        reference: the landmark.
+        config: thresholds; its variant is taken where `strict` or `projection` are None.
+        strict: whether the region has to contain the subject; matters to directions and `in`.
+        projection: projection or half-space; matters to directions.
+        viewer: (4, 4) T_map_camera of who looks (optical axes); directions are then seen from there.
+
+    Raises:
+        UnknownNameError: `name` is no relation.
+    """
+    if name not in RELATIONS:
+        raise UnknownNameError("relation", name, RELATIONS)
+    if viewer is None or name not in DIRECTIONS:
+        margins = relation_margins([subject, reference], config, strict=strict, projection=projection)
+        return float(margins[0, 1, RELATIONS.index(name)])
+    if subject.shape.layout or reference.shape.layout:
+        return -np.inf
+    seen = viewer_box(reference.box, viewer)
+    axis, sign = kernels.DIRECTION_AXES[DIRECTIONS.index(name)]
+    # The viewer's left and front are mirrored against a body's own: x of the box looks at the viewer, y to his right.
+    sign = -sign if axis == 1 else sign
+    return float(
+        kernels.direction_margin(
+            *_parts(subject.box),
+            *_parts(seen),
+            axis,
+            sign,
+            config.parameters(strict=strict, projection=projection),
+            np.inf,
+        )
+    )
+
+
+def viewer_box(box: OrientedBox, T_map_viewer: Float64) -> OrientedBox:
+    """The box around a box whose x axis points horizontally at the viewer; z is up.
+
+    `T_map_viewer` is an optical camera's pose. A viewer straight above takes the upper edge of his image as away from him.
+    """
+    towards = T_map_viewer[:2, 3] - box.T_map_box[:2, 3]
+    if np.hypot(*towards) < 1e-6:
+        towards = T_map_viewer[:2, 1]
+    norm = float(np.hypot(*towards))
+    x, y = towards / norm if norm > 1e-9 else (1.0, 0.0)
+    R = np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, box.T_map_box[:3, 3]
+    return OrientedBox(T, np.abs(R.T @ box.T_map_box[:3, :3]) @ np.asarray(box.extents, dtype=float))
+
+
+def room_margins(points: Float64, room: Room) -> Float64:
+    """(N,) metres from the outline of a room, >= 0 inside, of map points (N, 2) or (N, 3)."""
+    start = np.asarray(room.polygon, dtype=float)
+    end = np.roll(start, -1, axis=0)
+    p = np.asarray(points, dtype=float)[:, None, :2]
+    edge = end - start
+    share = np.clip(((p - start) * edge).sum(axis=2) / np.maximum((edge**2).sum(axis=1), 1e-18), 0.0, 1.0)
+    distance = np.linalg.norm(p - start - share[..., None] * edge, axis=2).min(axis=1)
+    straddles = (start[:, 1] > p[..., 1]) != (end[:, 1] > p[..., 1])
+    rise = np.where(edge[:, 1] == 0.0, 1.0, edge[:, 1])
+    crossing = start[:, 0] + (p[..., 1] - start[:, 1]) / rise * edge[:, 0]
+    inside = np.count_nonzero(straddles & (p[..., 0] < crossing), axis=1) % 2 == 1
+    return np.where(inside, distance, -distance)
+
+
+def _parts(box: OrientedBox) -> tuple[Float64, Float64, Float64]:
+    T = np.asarray(box.T_map_box, dtype=float)
+    return T[:3, 3].copy(), T[:3, :3].copy(), 0.5 * np.asarray(box.extents, dtype=float)
+
+
+def _reach(shape: Shape, config: RelationConfig) -> float:
+    """Radius about a body's centre outside of which nothing is related to it in the live variant."""
+    half = 0.5 * np.asarray(shape.extents, dtype=float)
+    reach = float(np.linalg.norm(half)) + config.near_range + config.leave_margin
+    for support in shape.supports:
+        corner = np.linalg.norm(support.T_entity_field[:3, 3]) + 0.5 * np.linalg.norm(support.size)
+        reach = max(reach, float(corner) + config.on_distance + config.leave_margin)
+    if shape.layout:
+        return reach
+    if not config.projection:
+        return np.inf
+    for axis in range(3):
+        far = half.copy()
+        far[axis] *= 1.0 + 2.0 * config.projection_factor
+        reach = max(reach, float(np.linalg.norm(far)) + config.leave_margin)
+    return reach
+
+
+_PER_SLOT = (
+    "centres",
+    "rotations",
+    "halves",
+    "interior_centres",
+    "interior_halves",
+    "layout",
+    "reach",
+    "radii",
+    "fields",
+    "supports",
+)
+
+
+def _empty_world(capacity: int) -> World:
+    return World(
+        centres=np.zeros((capacity, 3)),
+        rotations=np.zeros((capacity, 3, 3)),
+        halves=np.zeros((capacity, 3)),
+        interior_centres=np.zeros((capacity, 3)),
+        interior_halves=np.zeros((capacity, 3)),
+        layout=np.zeros(capacity, dtype=np.bool_),
+        reach=np.zeros(capacity),
+        radii=np.zeros(capacity),
+        fields=np.zeros((capacity, 6), dtype=np.int32),
+        supports=np.zeros((capacity, 2), dtype=np.int32),
+        field_rotations=np.zeros((0, 3, 3)),
+        field_origins=np.zeros((0, 3)),
+        field_sizes=np.zeros((0, 2)),
+        field_shapes=np.zeros((0, 3), dtype=np.int32),
+        heights=np.zeros(0),
+    )
+
+
+__all__ = [
+    "CONVERSE",
+    "DIRECTIONS",
+    "RELATIONS",
+    "SYMMETRIC",
+    "Body",
+    "BodyArrays",
+    "RelationConfig",
+    "relation_margin",
+    "relation_margins",
+    "room_margins",
+    "viewer_box",
+]

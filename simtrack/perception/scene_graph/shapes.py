@@ -1,0 +1,206 @@
+"""What the relations need to know of a body's form: box, surfaces that things rest on, interior of a container.
+
+Two bodies rest on each other where the surface that one shows to the sky meets the surface that the other shows to the
+ground. Both are height fields over the faces of the body's box, rasterised once per class from the model's mesh; so the
+floor of an open container, the step of an L-shaped tool and the flat top of a box are all found without being declared.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+
+from simtrack.contracts import Float64, MapEntity
+from simtrack.errors import InvalidValueError
+from simtrack.geometry.transforms import inverse, transform
+
+_FINE_CELL, _FINE_CELLS = 0.002, 128
+"""Metres and number: resolution at which meshes are rasterised."""
+_CONTACT_CELLS = 24
+"""Cells per side that take part in contact tests."""
+_BASIN_DEPTH, _BASIN_AREA = 0.3, 0.25
+"""A model is a container if a hollow deeper than this share of its height covers this share of its footprint."""
+_BOX_CELLS = 8
+"""Cells per side of the faces of a body that is known by its box alone."""
+
+
+class ModelLike(Protocol):
+    """What is needed of an object model; a `mesh` with `vertices` (V, 3) and `faces` (F, 3) is used if present."""
+
+    @property
+    def semantic_class(self) -> str:
+        """Class in the background taxonomy, e.g. ``tool``."""
+        ...
+
+    @property
+    def extents(self) -> Float64:
+        """(3,) full side lengths of the model's box, metres."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class HeightField:
+    """A surface seen from outside along the normal of a rectangle."""
+
+    T_entity_field: Float64
+    """(4, 4), origin in the rectangle's centre, z outward."""
+    size: Float64
+    """(2,), metres along the field's x and y."""
+    heights: Float64
+    """(U, V), metres along z at the centres of equal cells, -inf where there is no surface."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interior:
+    """The hollow of a container, open at its top (+z of the entity)."""
+
+    centre: Float64
+    """(3,), entity frame."""
+    extents: Float64
+    """(3,), metres; the lower side is the inner floor, the upper side the rim."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """The form of a class of bodies, in the frame of the body (origin in the centre of its box, z up)."""
+
+    extents: Float64
+    """(3,), full side lengths, metres."""
+    fields: tuple[HeightField, ...]
+    """Six, seen from +x, -x, +y, -y, +z, -z."""
+    supports: tuple[HeightField, ...] = ()
+    """Declared faces that things stand on; if there are any, nothing else of the body supports."""
+    interior: Interior | None = None
+    """Given for containers."""
+    layout: bool = False
+    """Floor, wall or ceiling: carries and touches, but is no landmark for directions."""
+
+    def __post_init__(self) -> None:
+        extents = np.asarray(self.extents, dtype=float)
+        if extents.shape != (3,) or not np.isfinite(extents).all() or not (extents > 0).all():
+            raise InvalidValueError("Shape.extents", self.extents, "three positive finite lengths in metres")
+
+
+def box_shape(extents: Float64, *, interior: Interior | None = None, layout: bool = False) -> Shape:
+    """Shape of a body of which only the box is known; `extents` (3,) in metres."""
+    extents = np.asarray(extents, dtype=float)
+    fields = []
+    for side in range(6):
+        T, size = _face(extents, side)
+        fields.append(HeightField(T, size, np.zeros((_BOX_CELLS, _BOX_CELLS))))
+    return Shape(extents=extents, fields=tuple(fields), interior=interior, layout=layout)
+
+
+def model_shape(model: ModelLike) -> Shape:
+    """Shape of a catalogue object: from its mesh if it has one, else from its box.
+
+    The mesh is in the object frame, whose origin is the centre of the box.
+    """
+    extents = np.asarray(model.extents, dtype=float)
+    mesh = getattr(model, "mesh", None)
+    if mesh is None or len(mesh.faces) == 0:
+        return box_shape(extents)
+    vertices = np.asarray(mesh.vertices, dtype=float)
+    faces = np.asarray(mesh.faces, dtype=np.int64)
+    fields: list[HeightField] = []
+    interior = None
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        cells = np.clip(np.round(extents[[u, v]] / _FINE_CELL), _BOX_CELLS, _FINE_CELLS).astype(int)
+        highest, lowest = _rasterise(vertices[:, [u, v, axis]].copy(), faces, extents[[u, v]], cells[0], cells[1])
+        for side, seen in ((2 * axis, highest), (2 * axis + 1, -lowest[:, ::-1])):
+            T, size = _face(extents, side)
+            fields.append(HeightField(T, size, _coarse(seen - 0.5 * extents[axis])))
+        if axis == 2:
+            interior = _find_interior(highest, extents)
+    return Shape(extents=extents, fields=tuple(fields), interior=interior)
+
+
+def map_entity_shape(entity: MapEntity, container_classes: Collection[str], layout_classes: Collection[str]) -> Shape:
+    """Shape of a piece of the static map; containers are hollow boxes, open in the front and on top."""
+    extents = np.asarray(entity.extents, dtype=float)
+    interior = Interior(np.zeros(3), extents) if entity.semantic_class in container_classes else None
+    T_entity_map = inverse(entity.T_map_entity)
+    supports = tuple(
+        HeightField(T_entity_map @ T_map_face, np.asarray(size, dtype=float), np.zeros((1, 1)))
+        for T_map_face, size in entity.supports
+    )
+    fields = box_shape(extents).fields
+    layout = entity.semantic_class in layout_classes
+    return Shape(extents=extents, fields=fields, supports=supports, interior=interior, layout=layout)
+
+
+def _face(extents: Float64, side: int) -> tuple[Float64, Float64]:
+    """Frame (4, 4) and size (2,) of one side of the box, in the order +x, -x, +y, -y, +z, -z."""
+    axis, sign = side // 2, 1.0 - 2.0 * (side % 2)
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    R = np.zeros((3, 3))
+    R[u, 0], R[v, 1], R[axis, 2] = 1.0, sign, sign
+    return transform(R, 0.5 * extents[axis] * R[:, 2]), extents[[u, v]].copy()
+
+
+def _coarse(heights: Float64) -> Float64:
+    picks = [((np.arange(m) + 0.5) * n / m).astype(int) for n in heights.shape for m in (min(n, _CONTACT_CELLS),)]
+    return np.ascontiguousarray(heights[np.ix_(*picks)])
+
+
+def _find_interior(highest: Float64, extents: Float64) -> Interior | None:
+    """The hollow that walls enclose on all sides, seen from above; `highest` (U, V) is z over x, y."""
+    from scipy.ndimage import label
+
+    low = highest < 0.5 * extents[2] - _BASIN_DEPTH * extents[2]
+    labels = np.asarray(label(np.pad(low, 1, constant_values=True))[0])
+    basin = (low & (labels[1:-1, 1:-1] != labels[0, 0])) & np.isfinite(highest)
+    if basin.mean() < _BASIN_AREA:
+        return None
+    floor = float(np.median(highest[basin]))
+    rows, columns = np.nonzero(basin.any(axis=1))[0], np.nonzero(basin.any(axis=0))[0]
+    cell = extents[:2] / np.array(highest.shape)
+    lower = np.array([rows[0], columns[0]]) * cell - 0.5 * extents[:2]
+    upper = np.array([rows[-1] + 1, columns[-1] + 1]) * cell - 0.5 * extents[:2]
+    rim = 0.5 * float(extents[2])
+    centre = np.array([*(0.5 * (lower + upper)), 0.5 * (floor + rim)])
+    return Interior(centre, np.array([*(upper - lower), rim - floor]))
+
+
+@njit(cache=True, nogil=True)
+def _rasterise(points, faces, size, nu, nv):
+    """Highest and lowest surface over a grid centred on the origin; (nu, nv) each, -inf and +inf where there is none.
+
+    Cell centres inside a triangle are interpolated; edges are sampled on top, so that thin walls leave no gap.
+    """
+    highest = np.full((nu, nv), -np.inf)
+    lowest = np.full((nu, nv), np.inf)
+    du = size[0] / nu
+    dv = size[1] / nv
+    for f in range(faces.shape[0]):
+        a, b, c = points[faces[f, 0]], points[faces[f, 1]], points[faces[f, 2]]
+        for p, q in ((a, b), (b, c), (c, a)):
+            steps = int(2.0 * max(abs(q[0] - p[0]) / du, abs(q[1] - p[1]) / dv)) + 1
+            for s in range(steps + 1):
+                w = s / steps
+                i = min(max(int((p[0] + w * (q[0] - p[0]) + 0.5 * size[0]) / du), 0), nu - 1)
+                j = min(max(int((p[1] + w * (q[1] - p[1]) + 0.5 * size[1]) / dv), 0), nv - 1)
+                z = p[2] + w * (q[2] - p[2])
+                highest[i, j] = max(highest[i, j], z)
+                lowest[i, j] = min(lowest[i, j], z)
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if abs(area) < 1e-14:
+            continue
+        i0 = max(int((min(a[0], b[0], c[0]) + 0.5 * size[0]) / du), 0)
+        i1 = min(int((max(a[0], b[0], c[0]) + 0.5 * size[0]) / du) + 1, nu)
+        j0 = max(int((min(a[1], b[1], c[1]) + 0.5 * size[1]) / dv), 0)
+        j1 = min(int((max(a[1], b[1], c[1]) + 0.5 * size[1]) / dv) + 1, nv)
+        for i in range(i0, i1):
+            x = (i + 0.5) * du - 0.5 * size[0]
+            for j in range(j0, j1):
+                y = (j + 0.5) * dv - 0.5 * size[1]
+                wb = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area
+                wc = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area
+                if wb >= 0.0 and wc >= 0.0 and wb + wc <= 1.0:
+                    z = a[2] + wb * (b[2] - a[2]) + wc * (c[2] - a[2])
+                    highest[i, j] = max(highest[i, j], z)
+                    lowest[i, j] = min(lowest[i, j], z)
+    return highest, lowest
