@@ -1,0 +1,1 @@
+"""The simulated world: scene files, robot, hand, clock, sensors' views and the ground truth."""

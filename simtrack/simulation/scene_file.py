@@ -226,8 +226,10 @@ class SensorSettings(_Strict):
     """Fields of `LidarNoiseConfig`."""
     odometry: dict[str, Any] = Field(default_factory=dict)
     """Fields of `OdometryNoiseConfig`."""
-    feed: dict[str, Any] = Field(default_factory=dict)
-    """Fields of `FeedFaults`: dropped, late and duplicated frames."""
+    encoders: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `EncoderNoiseConfig`."""
+    feed: dict[str, dict[str, float]] = Field(default_factory=dict)
+    """Sensor (``camera``, ``lidar``, ``odometry``, ``joints``) -> fields of `FeedFaults`."""
     calibration: dict[str, Any] = Field(default_factory=dict)
     """Fields of `CalibrationFaults`."""
 
@@ -303,6 +305,13 @@ class _Loader(yaml.SafeLoader):
             twice = next(key for key in keys if keys.count(key) > 1)
             raise yaml.constructor.ConstructorError(None, None, f"key '{twice}' occurs twice", node.start_mark)
         return super().construct_mapping(node, deep)
+
+
+# As in YAML 1.2, only true and false are booleans: `on` is the name of a field here.
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in rules if first in "tTfF" or not tag.endswith(":bool")]
+    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
 
 
 def scene_names() -> dict[str, Path]:

@@ -1,0 +1,319 @@
+"""What is really the case, at any moment so far. Nothing that estimates may import this."""
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from simtrack.contracts import NANOSECONDS, CameraIntrinsics, Float64, Int32
+from simtrack.errors import UnknownNameError
+from simtrack.geometry.transforms import apply, difference, inverse
+from simtrack.raycast import RayBundle, RayScene, TriangleMesh
+from simtrack.simulation.history import KEY_NS, History
+from simtrack.simulation.world import COLLISION, SENSOR_BODIES, World, body_pose
+from simtrack.simulation.world_rays import WorldRays
+
+if TYPE_CHECKING:
+    import mujoco
+
+CONTACT_WINDOW = 20_000_000
+"""Nanoseconds: contacts within it count, so that one that chatters for a physics step does not flicker."""
+SUPPORTING = 0.5
+"""Cosine between a contact's normal and the vertical above which one thing stands on the other."""
+SILHOUETTE_RAYS = 900
+"""About how many rays measure the visibility of one object."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectTruth:
+    """One movable thing at one moment."""
+
+    name: str
+    """Name in the scene, e.g. ``screwdriver-2``."""
+    class_name: str
+    """Name of its model; ``hand`` for the hand."""
+    kind: Literal["catalogue", "clutter", "actor"]
+    T_map_object: Float64
+    """(4, 4)."""
+    velocity: Float64
+    """(6,), m/s of the origin and rad/s, map frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The world at one moment."""
+
+    stamp: int
+    """Nanoseconds."""
+    T_map_base: Float64
+    """(4, 4)."""
+    T_map_camera: Float64
+    """(4, 4), optical frame."""
+    T_map_lidar: Float64
+    """(4, 4)."""
+    objects: Mapping[str, ObjectTruth]
+    contacts: frozenset[tuple[str, str]]
+    """(supported, supporter): touches it from above; supporters are objects or furniture."""
+    touching: frozenset[tuple[str, str]]
+    """Pairs in alphabetical order that touch anyhow."""
+
+
+@dataclass(frozen=True, slots=True)
+class Visibility:
+    """How much of an object the camera sees."""
+
+    pixels: int
+    """Visible pixels in the image, estimated from strided rays."""
+    fraction: float
+    """0 to 1: visible share of the whole silhouette, including the part of it outside of the image."""
+
+
+class GroundTruth:
+    """Answers for any stamp from 0 to now (nanoseconds); later ones raise `InvalidValueError`."""
+
+    def __init__(self, world: World, history: History, rays: WorldRays, intrinsics: CameraIntrinsics) -> None:
+        import mujoco
+
+        self._world, self._history, self._rays = world, history, rays
+        self._intrinsics = intrinsics
+        self._scratch = mujoco.MjData(world.model)
+        self._sensors = {frame: world.model.body(body).id for frame, body in SENSOR_BODIES.items()}
+        self._movable = {name: body for name, body in world.bodies.items() if name != "robot"}
+        self._contacts = _ContactLog(world)
+        self._alone: RayScene | None = None
+        self._lidar: dict[int, Int32] = {}
+        self._full: RayBundle | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What ids index: furniture and building parts, ``robot``, ``hand``, objects and clutter."""
+        return self._world.names
+
+    def class_of(self, name: str) -> str:
+        """Name of the model of an object of the scene, ``hand`` for the hand."""
+        if name in self._world.objects:
+            return self._world.objects[name].name
+        if name in self._movable:
+            return name
+        raise UnknownNameError("object of the scene", name, self._movable)
+
+    def kind_of(self, name: str) -> Literal["catalogue", "clutter", "actor"]:
+        """What sort of thing a movable thing is."""
+        if name not in self._world.objects:
+            return "actor"
+        return "catalogue" if self._world.is_catalogue(name) else "clutter"
+
+    def at(self, stamp: int) -> Truth:
+        """Everything at a stamp."""
+        scratch = self._scratch
+        early = max(0, stamp - KEY_NS)
+        late = min(self._history.end, stamp + KEY_NS)
+        around = []
+        for moment in (early, late):
+            self._history.load(moment, scratch)
+            around.append({name: body_pose(scratch, body) for name, body in self._movable.items()})
+        seconds = max(late - early, 1) / NANOSECONDS
+        self._history.load(stamp, scratch)
+        objects = {
+            name: ObjectTruth(
+                name, self.class_of(name), self.kind_of(name), body_pose(scratch, body),
+                difference(around[1][name], around[0][name]) / seconds,
+            )
+            for name, body in self._movable.items()
+        }  # fmt: skip
+        contacts, touching = self._contacts.at(stamp)
+        base = body_pose(scratch, self._world.bodies["robot"])
+        camera, lidar = (body_pose(scratch, self._sensors[frame]) for frame in ("camera", "lidar"))
+        return Truth(stamp, base, camera, lidar, objects, contacts, touching)
+
+    def joint_positions(self, stamp: int) -> dict[str, float]:
+        """True positions of the robot's joints, rad or m."""
+        values = self._world.controller.joint_positions(self._history.qpos(stamp))
+        return dict(zip(self._world.controller.joint_names, values.tolist(), strict=True))
+
+    # ------------------------------------------------------------------------------------------------------- visibility
+
+    def visibility(self, stamp: int) -> dict[str, Visibility]:
+        """How much of each object (catalogue and clutter) the camera sees; objects behind it are not seen at all."""
+        self._load(stamp)
+        T_map_camera = body_pose(self._scratch, self._sensors["camera"])
+        names, poses = self._object_poses()
+        owners, rays, area = self._silhouette_rays(T_map_camera, names, poses)
+        result = dict.fromkeys(names, Visibility(0, 0.0))
+        if not len(rays):
+            return result
+        directions = rays @ T_map_camera[:3, :3].T
+        # Each object alone: they stand far apart from one another, and each ray starts in front of its own.
+        alone, offsets = self._objects_apart(names, poses)
+        own = alone.cast_rays(T_map_camera[:3, 3] + offsets[owners], directions).instances == owners
+        owners, rays, directions = owners[own], rays[own], directions[own]
+        origins = np.broadcast_to(T_map_camera[:3, 3], directions.shape)
+        hits = self._rays.scene.cast_rays(origins, directions, min_distance=0.03)
+        index = np.array([self.names.index(name) for name in names])
+        inside = self._in_image(rays)
+        seen = inside & (self._rays.ids(hits) == index[owners])
+        for k, name in enumerate(names):
+            mine = owners == k
+            whole = int(np.count_nonzero(mine))
+            if whole:
+                visible = int(np.count_nonzero(seen & mine))
+                result[name] = Visibility(round(visible * float(area[k])), visible / whole)
+        return result
+
+    def ids(self, stamp: int) -> Int32:
+        """(H, W), index into `names` of what each pixel of the camera sees, -1 = nothing."""
+        self._load(stamp)
+        if self._full is None:
+            self._full = RayBundle.from_camera(self._intrinsics)
+        T_map_camera = body_pose(self._scratch, self._sensors["camera"])
+        hits = self._rays.scene.cast(self._full, T_map_camera, min_distance=0.03)
+        return self._rays.ids(hits).reshape(self._intrinsics.height, self._intrinsics.width)
+
+    def lidar_ids(self, stamp: int) -> Int32:
+        """(N,), index into `names` of what each shot of the scan that began at `stamp` hit, -1 = nothing.
+
+        The last scans are kept; older ones raise `UnknownNameError`.
+        """
+        if stamp not in self._lidar:
+            raise UnknownNameError("scan", str(stamp), (str(kept) for kept in self._lidar))
+        return self._lidar[stamp]
+
+    # ------------------------------------------------------------------------------------------- what the clock reports
+
+    def record(self, data: "mujoco.MjData") -> None:
+        """Take the contacts of the key that was just appended to the history."""
+        self._contacts.append(data)
+
+    def record_scan(self, stamp: int, ids: Int32, keep: int = 8) -> None:
+        """Keep what the shots of a scan hit, of the last `keep` scans."""
+        self._lidar[stamp] = ids
+        while len(self._lidar) > keep:
+            del self._lidar[min(self._lidar)]
+
+    # -------------------------------------------------------------------------------------------------------- internals
+
+    def _load(self, stamp: int) -> None:
+        self._history.load(stamp, self._scratch)
+        self._rays.place(self._scratch)
+
+    def _object_poses(self) -> tuple[list[str], Float64]:
+        names = list(self._world.objects)
+        poses = [body_pose(self._scratch, self._movable[name]) for name in names]
+        return names, np.array(poses).reshape(-1, 4, 4)
+
+    def _objects_apart(self, names: list[str], poses: Float64) -> tuple[RayScene, Float64]:
+        """A scene in which object k is instance k, displaced by its row of the offsets (K, 3)."""
+        if self._alone is None:
+            self._alone = RayScene()
+            meshes: dict[int, TriangleMesh] = {}
+            for k, name in enumerate(names):
+                mesh = self._world.objects[name].mesh
+                if id(mesh) not in meshes:
+                    meshes[id(mesh)] = TriangleMesh(mesh.vertices, mesh.faces, name)
+                self._alone.add(meshes[id(mesh)], instance=k)
+        offsets = np.zeros((len(names), 3))
+        offsets[:, 2] = 200.0 * np.arange(len(names))
+        for k, T in enumerate(poses):
+            shifted = T.copy()
+            shifted[:3, 3] += offsets[k]
+            self._alone.set_pose(k, shifted)
+        return self._alone, offsets
+
+    def _silhouette_rays(
+        self, T_map_camera: Float64, names: list[str], poses: Float64
+    ) -> tuple[np.ndarray, Float64, Float64]:
+        """Rays (camera frame, z = 1) over the projected box of each object: owners (R,), rays (R, 3), pixels a ray (K,)."""
+        camera = self._intrinsics
+        owners, rays, area = [], [], np.zeros(len(names))
+        T_camera_map = inverse(T_map_camera)
+        for k, (name, T) in enumerate(zip(names, poses, strict=True)):
+            corners = apply(T_camera_map @ T, self._world.objects[name].keypoints)
+            if corners[:, 2].min() < 0.05:
+                continue
+            low = (corners[:, :2] / corners[:, 2:]).min(axis=0) * camera.fx
+            high = (corners[:, :2] / corners[:, 2:]).max(axis=0) * camera.fx
+            stride = max(1, int(np.sqrt(np.prod(high - low) / SILHOUETTE_RAYS)))
+            # On the pixel grid, so that a pixel counts as visible exactly if its ray is.
+            u = np.arange(np.floor(low[0] + camera.cx), np.ceil(high[0] + camera.cx) + 1, stride)
+            v = np.arange(np.floor(low[1] + camera.cy), np.ceil(high[1] + camera.cy) + 1, stride)
+            uu, vv = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+            rays.append(np.stack([uu.ravel(), vv.ravel(), np.ones(uu.size)], axis=1))
+            owners.append(np.full(uu.size, k))
+            area[k] = stride**2
+        if not rays:
+            return np.zeros(0, np.int64), np.zeros((0, 3)), area
+        return np.concatenate(owners), np.concatenate(rays), area
+
+    def _in_image(self, rays: Float64) -> np.ndarray:
+        camera = self._intrinsics
+        u, v = rays[:, 0] * camera.fx + camera.cx, rays[:, 1] * camera.fy + camera.cy
+        return (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
+
+    def close(self) -> None:
+        """Release ray scenes."""
+        if self._alone is not None:
+            self._alone.close()
+
+
+class _ContactLog:
+    """Contacts between things, kept only where they change."""
+
+    def __init__(self, world: World) -> None:
+        names = world.names
+        index = {name: k for k, name in enumerate(names)}
+        self._names = names
+        self._owner = _owners_of_collision_geoms(world, index)
+        self._is_object = np.array([name in world.objects for name in names])
+        self._keys: list[int] = []
+        self._sets: list[tuple[np.ndarray, np.ndarray]] = []
+        self._count = 0
+
+    def append(self, data: "mujoco.MjData") -> None:
+        contact = data.contact
+        pairs = self._owner[contact.geom]
+        up = contact.frame[:, 2]
+        real = (pairs >= 0).all(axis=1) & (contact.dist <= 0.0) & (pairs[:, 0] != pairs[:, 1])
+        first, second, up = pairs[real, 0], pairs[real, 1], up[real]
+        real = self._is_object[first] | self._is_object[second]
+        first, second, up = first[real], second[real], up[real]
+        base = len(self._names)
+        above = np.where(up > 0, second, first)
+        below = np.where(up > 0, first, second)
+        stands = (np.abs(up) > SUPPORTING) & self._is_object[above]
+        supports = np.unique((above * base + below)[stands])
+        touches = np.unique(np.minimum(first, second) * base + np.maximum(first, second))
+        stamp, self._count = self._count * KEY_NS, self._count + 1
+        last = self._sets[-1] if self._sets else None
+        if last is None or not (np.array_equal(last[0], supports) and np.array_equal(last[1], touches)):
+            self._keys.append(stamp)
+            self._sets.append((supports, touches))
+
+    def at(self, stamp: int) -> tuple[frozenset[tuple[str, str]], frozenset[tuple[str, str]]]:
+        low = max(0, bisect_right(self._keys, stamp - CONTACT_WINDOW) - 1)
+        high = max(low + 1, bisect_right(self._keys, stamp + CONTACT_WINDOW))
+        supports = {int(code) for kept in self._sets[low:high] for code in kept[0]}
+        touches = {int(code) for kept in self._sets[low:high] for code in kept[1]}
+        base = len(self._names)
+
+        def named(code: int) -> tuple[str, str]:
+            return self._names[code // base], self._names[code % base]
+
+        pairs = frozenset((a, b) if a < b else (b, a) for a, b in map(named, touches))
+        return frozenset(map(named, supports)), pairs
+
+
+def _owners_of_collision_geoms(world: World, index: Mapping[str, int]) -> Int32:
+    """(ngeom,), index of the thing that a collision geom belongs to, -1 for the robot and for what is unnamed."""
+    import mujoco
+
+    model = world.model
+    by_body = {instance.body: instance.name for instance in world.instances if instance.body != 0}
+    owners = np.full(model.ngeom, -1, np.int32)
+    for geom in np.flatnonzero(model.geom_group == COLLISION):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, int(geom)) or ""
+        body = int(model.geom_bodyid[geom])
+        owner = by_body.get(body, name.removeprefix("static/").rpartition("#")[0])
+        owners[geom] = -1 if owner == "robot" else index.get(owner, -1)
+    return owners

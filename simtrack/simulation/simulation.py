@@ -1,0 +1,284 @@
+"""The clock: runs physics, hand and robot, and lets every sensor look at its own time."""
+
+from collections.abc import Callable
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from simtrack.contracts import (
+    NANOSECONDS,
+    Command,
+    Float64,
+    JointState,
+    LidarScan,
+    RgbdFrame,
+    SensorFrame,
+    StaticMap,
+)
+from simtrack.errors import FileFormatError, SimtrackError
+from simtrack.geometry.kinematics import KinematicTree
+from simtrack.geometry.transforms import transform
+from simtrack.objects import ObjectModel, TrackerModelConfig, tracker_model
+from simtrack.raycast import RayBundle
+from simtrack.sensors.camera import XTION, CameraModel
+from simtrack.sensors.faults import CalibrationFaults, FaultyFeed, FeedFaults
+from simtrack.sensors.lidar import VLP16, LidarModel, LidarNoiseConfig, apply_lidar_noise, reflected_intensity
+from simtrack.sensors.odometry import EncoderNoiseConfig, OdometryNoiseConfig, OdometrySensor, read_encoders
+from simtrack.simulation.ground_truth import GroundTruth
+from simtrack.simulation.hand_script import HandDirector
+from simtrack.simulation.history import KEY_NS, History
+from simtrack.simulation.randomness import stream
+from simtrack.simulation.rendering import make_renderer
+from simtrack.simulation.scene_file import SceneFile
+from simtrack.simulation.world import SENSOR_BODIES, TIMESTEP_NS, build_world, configured
+from simtrack.simulation.world_rays import WorldRays
+
+if TYPE_CHECKING:
+    pass
+
+PROPRIOCEPTION_NS = 20_000_000
+"""Nanoseconds between odometry readings and between joint states: 50 Hz."""
+FAR = 10.0
+"""Metres beyond which a depth camera of this kind reads nothing, so that nothing is rendered there."""
+
+
+class Simulation:
+    """A world that runs in simulated time and sends sensor frames; a context manager that releases OpenGL at its end.
+
+    Every purpose (placement, hand, camera noise, lidar noise, ...) has a random stream of its own, so that rendering or
+    not rendering RGB, say, changes nothing else.
+    """
+
+    def __init__(
+        self,
+        scene: SceneFile,
+        seed: int = 0,
+        renderer: str = "mujoco",
+        camera: CameraModel = XTION,
+        lidar: LidarModel = VLP16,
+    ) -> None:
+        """Build the world of `scene` for `seed` and let it settle; stamp 0 is the moment after.
+
+        Args:
+            scene: from `load_scene`.
+            seed: of everything random.
+            renderer: ``mujoco`` (falls back to rays, with a warning, where EGL is missing) or ``embree``.
+            camera: the camera in the head.
+            lidar: the lidar on the mast.
+
+        Raises:
+            SimtrackError: whatever is wrong with the scene; see `build_world`.
+        """
+        import mujoco
+
+        self.scene, self.seed = scene, seed
+        self.camera, self.lidar = camera, lidar
+        intrinsics = camera.intrinsics
+        fovy = 2.0 * np.arctan(intrinsics.height / (2.0 * intrinsics.fy))
+        self.world = build_world(scene, seed, float(fovy), (intrinsics.width, intrinsics.height))
+        self._configure()
+        self._data = self.world.data
+        self._scratch = mujoco.MjData(self.world.model)
+        self._history = History(self.world.model)
+        self._rays = WorldRays(self.world)
+        self.truth = GroundTruth(self.world, self._history, self._rays, intrinsics)
+        self._renderer = make_renderer(renderer, self.world, self._rays, intrinsics, FAR)
+        self._hand = HandDirector(self.world, stream(seed, "hand")) if scene.hand is not None else None
+        self._lidar_body = self.world.model.body(SENSOR_BODIES["lidar"]).id
+        self._shots = lidar.shots()
+        self._packing = RayBundle.from_directions(self._shots.directions, self._shots.rings)
+        self._counts = dict.fromkeys(("camera", "lidar", "proprioception"), 0)
+        self._now = 0
+        self._steps = 0
+        self._static_map: StaticMap | None = None
+        self._models: dict[str, ObjectModel] | None = None
+        self._remember()
+
+    def _configure(self) -> None:
+        """Sensor configurations from the scene file; raises FileFormatError."""
+        from simtrack.sensors.depth_noise import PRESETS
+
+        scene, sensors, seed = self.scene, self.scene.sensors, self.seed
+        if sensors.depth not in PRESETS:
+            raise FileFormatError(scene.path, "sensors.depth", f"unknown preset; allowed: {', '.join(sorted(PRESETS))}")
+        preset = PRESETS[sensors.depth]
+        self.depth_noise = configured(type(preset), sensors.depth_noise, scene, "sensors.depth_noise", preset)
+        self.lidar_noise = configured(LidarNoiseConfig, sensors.lidar_noise, scene, "sensors.lidar_noise")
+        self.odometry_noise = configured(OdometryNoiseConfig, sensors.odometry, scene, "sensors.odometry")
+        self.encoder_noise = configured(EncoderNoiseConfig, sensors.encoders, scene, "sensors.encoders")
+        self.calibration = configured(CalibrationFaults, sensors.calibration, scene, "sensors.calibration")
+        faults = {
+            name: configured(FeedFaults, values, scene, f"sensors.feed.{name}") for name, values in sensors.feed.items()
+        }
+        try:
+            self._feed = FaultyFeed(faults, stream(seed, "feed"))
+        except SimtrackError as error:
+            raise FileFormatError(scene.path, "sensors.feed", str(error)) from error
+        self._odometry = OdometrySensor(self.odometry_noise, stream(seed, "odometry"))
+        self._rng_depth, self._rng_lidar = stream(seed, "camera"), stream(seed, "lidar")
+        self._rng_encoders, self._rng_camera_pose = stream(seed, "encoders"), stream(seed, "camera pose")
+
+    # --------------------------------------------------------------------------------------------- what the robot knows
+
+    @property
+    def robot(self) -> KinematicTree:
+        """The robot's own description."""
+        return self.world.robot
+
+    @property
+    def static_map(self) -> StaticMap:
+        """The survey of the building, made once on first use: noisy, decimated, slightly outdated."""
+        if self._static_map is None:
+            from simtrack.simulation.survey import SurveyConfig, survey
+
+            config = configured(SurveyConfig, self.scene.survey, self.scene, "survey")
+            self._static_map = survey(self.world.static, config, stream(self.seed, "survey"))
+        return self._static_map
+
+    @property
+    def models(self) -> dict[str, ObjectModel]:
+        """The tracker's imperfect models of the scene's catalogue objects, by model name."""
+        if self._models is None:
+            config = configured(TrackerModelConfig, self.scene.tracker_models, self.scene, "tracker_models")
+            exact = {self.world.objects[thing.id].name: self.world.objects[thing.id] for thing in self.scene.objects}
+            self._models = {
+                name: tracker_model(model, config, stream(self.seed, f"tracker model {name}"))
+                for name, model in sorted(exact.items())
+            }
+        return self._models
+
+    @property
+    def start(self) -> Float64:
+        """(4, 4) T_map_base at stamp 0: what the robot is told of where it starts."""
+        return self.truth.at(0).T_map_base
+
+    # -------------------------------------------------------------------------------------------------------- the clock
+
+    @property
+    def now(self) -> int:
+        """Nanoseconds: the stamp of the last camera frame, 0 before the first."""
+        return self._now
+
+    @property
+    def camera_period(self) -> int:
+        """Nanoseconds between camera stamps."""
+        return self.camera.period
+
+    @property
+    def renderer(self) -> str:
+        """Name of the renderer in use."""
+        return self._renderer.name
+
+    def advance(self, command: Command, want_rgb: bool = False) -> list[SensorFrame]:
+        """Run under `command` until the next camera stamp; what arrived meanwhile, in arrival order.
+
+        Args:
+            command: held from `now` on.
+            want_rgb: render colour for the camera frame at the end.
+        """
+        self._counts["camera"] += 1
+        target = self._counts["camera"] * self.camera_period
+        while self._history.end < target:
+            self._step(command)
+        self._due(PROPRIOCEPTION_NS, "proprioception", target, self._send_proprioception)
+        self._due(self.lidar.period, "lidar", target - self.lidar.period, self._send_scan)
+        self._now = target
+        self._send_image(target, want_rgb)
+        return self._feed.receive(target)
+
+    def _due(self, period: int, sensor: str, until: int, send: Callable[[int], None]) -> None:
+        """Let a sensor look at each of its stamps that has come."""
+        while self._counts[sensor] * period <= until:
+            send(self._counts[sensor] * period)
+            self._counts[sensor] += 1
+
+    def _step(self, command: Command) -> None:
+        """Physics from one key of the history to the next."""
+        import mujoco
+
+        for _ in range(KEY_NS // TIMESTEP_NS):
+            self.world.controller.step(self._data, command)
+            if self._hand is not None:
+                self._hand.step(self._data)
+            mujoco.mj_step(self.world.model, self._data)
+        self._remember()
+
+    def _remember(self) -> None:
+        self._history.append(self._data)
+        self.truth.record(self._data)
+
+    # ------------------------------------------------------------------------------------------------------ the sensors
+
+    def _send_proprioception(self, stamp: int) -> None:
+        qpos = self._history.qpos(stamp)
+        x, y, yaw = self.world.controller.base(qpos)
+        T_map_base = transform(np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]))
+        T_map_base[:2, 3] = x, y
+        self._feed.send(self._odometry.read(stamp, T_map_base), stamp)
+        self._feed.send(self._encoders(qpos, stamp, self._rng_encoders), stamp)
+
+    def _encoders(self, qpos: Float64, stamp: int, rng: np.random.Generator) -> JointState:
+        controller = self.world.controller
+        positions = dict(zip(controller.joint_names, controller.joint_positions(qpos).tolist(), strict=True))
+        reading = self.calibration.apply(read_encoders(stamp, positions, self.encoder_noise, rng))
+        assert isinstance(reading, JointState)
+        return reading
+
+    def _send_image(self, stamp: int, want_rgb: bool) -> None:
+        from simtrack.sensors.depth_noise import apply_depth_noise
+
+        self._history.load(stamp, self._scratch)
+        exact = self._renderer.depth(self._scratch)
+        depth = apply_depth_noise(exact, None, self.camera.intrinsics, self.depth_noise, self._rng_depth)
+        rgb = self._renderer.rgb(self._scratch) if want_rgb else None
+        joints = self._encoders(self._history.qpos(stamp), stamp, self._rng_camera_pose)
+        believed = self.robot.forward(dict(zip(joints.names, joints.positions.tolist(), strict=True)))["camera"]
+        sequence = self._counts["camera"] - 1
+        frame = RgbdFrame(stamp, depth, rgb, self.camera.intrinsics, believed, sequence)
+        self._feed.send(self.calibration.apply(frame), stamp)
+
+    def _send_scan(self, stamp: int) -> None:
+        """One turn: each shot is cast from where sensor and objects are at its own time."""
+        shots, keys = self._shots, round(self.lidar.period / KEY_NS) + 1
+        poses, sensor = [], np.empty((keys, 4, 4))
+        for k in range(keys):
+            self._history.load(stamp + k * self.lidar.period / (keys - 1), self._scratch)
+            poses.append(self._rays.poses(self._scratch))
+            R = self._scratch.xmat[self._lidar_body].reshape(3, 3)
+            sensor[k] = transform(R, self._scratch.xpos[self._lidar_body])
+        self._rays.move(poses)
+        times = shots.times.astype(np.float64) * (NANOSECONDS / self.lidar.period)
+        index = np.minimum((times * (keys - 1)).astype(np.int64), keys - 2)
+        part = (times * (keys - 1) - index)[:, None, None]
+        T = (1.0 - part) * sensor[index, :3] + part * sensor[index + 1, :3]
+        directions = np.einsum("nij,nj->ni", T[:, :, :3], shots.directions)
+        hits = self._rays.scene.cast_rays(
+            T[:, :, 3], directions, times, self.lidar.max_range, min_distance=0.06, packing=self._packing
+        )
+        incidence = np.arccos(np.minimum(np.abs(np.einsum("ij,ij->i", hits.normals, directions)), 1.0))
+        intensities = reflected_intensity(self._rays.colors(hits).mean(axis=1), incidence)
+        ranges = apply_lidar_noise(hits.distances, intensities, self.lidar_noise, self._rng_lidar, incidence)
+        self.truth.record_scan(stamp, self._rays.ids(hits))
+        T_base_lidar = self.robot.forward({})["lidar"]
+        scan = LidarScan(
+            stamp, shots.directions, ranges, shots.times, shots.rings,
+            np.where(np.isfinite(ranges), intensities, 0.0).astype(np.float32), T_base_lidar, self._counts["lidar"],
+        )  # fmt: skip
+        self._feed.send(self.calibration.apply(scan), stamp + self.lidar.period)
+
+    # ---------------------------------------------------------------------------------------------------------- the end
+
+    def close(self) -> None:
+        """Release OpenGL and ray scenes; may be called twice. What was measured stays readable."""
+        self._renderer.close()
+        self.truth.close()
+        self._rays.close()
+
+    def __enter__(self) -> "Simulation":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
