@@ -1,5 +1,6 @@
 """Compiled loops of the depth noise. Inverse depth is linear in pixel coordinates on a plane, hence used throughout."""
 
+from functools import cache
 from typing import NamedTuple
 
 import numba as nb
@@ -8,7 +9,6 @@ import numpy as np
 from simtrack.contracts import Float32
 
 _HALF_PI = np.float32(np.pi / 2)
-_DEG_60 = np.float32(np.deg2rad(60.0))
 _MAX_SHIFT = 4
 """Pixels: lateral shifts are cut here."""
 _SHADOW_SLACK = np.float32(1.5)
@@ -16,25 +16,35 @@ _SHADOW_SLACK = np.float32(1.5)
 
 
 class Parameters(NamedTuple):
-    """`DepthNoiseConfig` as kernels take it."""
+    """`DepthNoiseConfig` as kernels take it: float32 numbers only, since arrays would be reference-counted a pixel."""
 
-    axial: Float32
-    """offset m, quadratic 1/m, origin m, grazing."""
-    max_incidence: float
-    lateral: int
-    """0 none, 1 at edges, 2 everywhere."""
-    lateral_sigma: Float32
-    """sigma px, grazing px."""
-    disparity_step: float
+    axial_offset: np.float32
+    axial_quadratic: np.float32
+    axial_origin: np.float32
+    axial_grazing: np.float32
+    max_incidence: np.float32
+    lateral_sigma: np.float32
+    lateral_grazing: np.float32
+    disparity_step: np.float32
     """1/m, in units of inverse depth; 0 = none."""
-    grazing: Float32
-    """centre and width of the loss, rad."""
-    albedo_floor: float
-    dropout: float
-    flying_pixels: float
-    simkinect: bool
-    limits: Float32
-    """m."""
+    grazing_dropout: np.float32
+    grazing_width: np.float32
+    grazing_cosine: np.float32
+    """Cosine of the incidence above which no reading is lost to it."""
+    albedo_floor: np.float32
+    """1/m^2: albedo floor over squared range."""
+    dropout: np.float32
+    flying_pixels: np.float32
+    min_range: np.float32
+    max_range: np.float32
+
+
+@cache
+def normal_quantiles() -> Float32:
+    """(4096,) of the standard normal distribution: lateral shifts are whole pixels, so twelve random bits make one."""
+    from statistics import NormalDist
+
+    return np.array([NormalDist().inv_cdf((i + 0.5) / 4096) for i in range(4096)], np.float32)
 
 
 def window(width: int) -> Float32:
@@ -47,16 +57,19 @@ def window(width: int) -> Float32:
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def blend_correlated(axial, white, weights, share):
-    """Make `axial` sqrt(1 - share) of itself plus sqrt(share) of `white` filtered along rows and columns, in place."""
+    """Make `axial` sqrt(1 - share) of itself plus sqrt(share) of filtered `white`, in place.
+
+    `white` is uniform in 0..1, (H + taps - 1, W + taps - 1), and filtered along rows and columns.
+    """
     height, width = axial.shape
     taps = weights.shape[0]
-    own, smooth = np.float32(np.sqrt(1.0 - share)), np.float32(np.sqrt(share))
+    own, smooth = np.float32(np.sqrt(1.0 - share)), np.float32(np.sqrt(12.0 * share))
     rows = np.zeros((height + taps - 1, width), np.float32)
     for v in range(height + taps - 1):
         for k in range(taps):
             weight = smooth * weights[k]
             for u in range(width):
-                rows[v, u] += weight * white[v, u + k]
+                rows[v, u] += weight * (white[v, u + k] - np.float32(0.5))
     for v in range(height):
         for u in range(width):
             axial[v, u] *= own
@@ -187,104 +200,101 @@ def projector_shadow(inverse, focal_baseline):
     return hidden
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, inline="always")
 def _shift(normal, sigma):
-    pixels = int(np.rint(normal * sigma))
-    return min(max(pixels, -_MAX_SHIFT), _MAX_SHIFT)
+    return min(max(int(np.rint(normal * sigma)), -_MAX_SHIFT), _MAX_SHIFT)
 
 
-@nb.njit(cache=True, nogil=True)
-def _source(v, u, cosines, edges, lateral, parameters):
-    """Row and column of the pixel whose surface pixel (v, u) reads."""
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def sources(cosines, edges, bits, quantiles, everywhere, p):
+    """(H, W) flat index of the pixel whose surface each pixel reads: itself, or at depth edges a neighbour."""
     height, width = cosines.shape
-    sigma = parameters.lateral_sigma[0]
-    if parameters.lateral_sigma[1] > 0.0 and (edges[v, u] or parameters.lateral == 2):
-        theta = min(np.arccos(cosines[v, u]), np.float32(parameters.max_incidence))
-        sigma += parameters.lateral_sigma[1] * theta / (_HALF_PI - theta)
-    row = min(max(v + _shift(lateral[v, u, 1], sigma), 0), height - 1)
-    column = min(max(u + _shift(lateral[v, u, 0], sigma), 0), width - 1)
-    if parameters.lateral == 2 or edges[v, u] or edges[row, column]:
-        return row, column
-    return v, u
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _lost(z, cosine, uniform, albedo, parameters):
-    """Whether this reading is lost to incidence, darkness or chance, decided by one uniform number."""
-    keep = np.float32(1.0 - parameters.dropout)
-    centre, spread = parameters.grazing[0], parameters.grazing[1]
-    if centre < _HALF_PI and cosine < np.cos(centre - np.float32(8.0) * spread):
-        keep /= np.float32(1.0) + np.exp((np.arccos(cosine) - centre) / spread)
-    if albedo >= 0.0 and parameters.albedo_floor > 0.0:
-        floor = np.float32(parameters.albedo_floor) * (z / parameters.limits[1]) ** 2
-        keep *= albedo * albedo / (albedo * albedo + floor * floor)
-    return uniform >= keep
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _axial(z, cosine, parameters):
-    """Standard deviation of what is added to z before rounding: that of the whole reading without rounding's share."""
-    a = parameters.axial
-    sigma = a[0] + a[1] * (z - a[2]) ** 2
-    if a[3] > 0.0 and cosine < np.float32(0.5):
-        theta = min(np.arccos(cosine), np.float32(parameters.max_incidence))
-        ratio = theta / (_HALF_PI - theta)
-        sigma += a[3] / np.sqrt(z) * ratio * ratio
-    rounding = np.float32(parameters.disparity_step) * z * z
-    variance = sigma * sigma - rounding * rounding / np.float32(12.0)
-    return np.sqrt(max(variance, np.float32(0.0)))
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _round(z, step, simkinect, normal):
-    """Depth after the sensor's own rounding."""
-    if step > 0.0:
-        levels = np.rint(np.float32(1.0 / step) / z)
-        z = np.float32(1.0 / step) / levels if levels > 0.0 else np.float32(0.0)
-    if simkinect and z > 0.0:
-        centimetres = np.rint(np.float32(100.0) * z)
-        shift = np.rint(np.float32(35130.0) / centimetres + normal / np.float32(6.0) + np.float32(0.5))
-        z = np.float32(351.30) / shift if centimetres > 0.0 and shift > 0.0 else np.float32(0.0)
-    return z
-
-
-@nb.njit(cache=True, nogil=True)
-def _mixed(v, u, inverse, share):
-    """Inverse depth of a flying pixel: between the nearest and the farthest surface around (v, u)."""
-    low = high = inverse[v, u]
-    for row in range(max(v - 1, 0), min(v + 2, inverse.shape[0])):
-        for column in range(max(u - 1, 0), min(u + 2, inverse.shape[1])):
-            w = inverse[row, column]
-            if w > 0.0:
-                low, high = min(low, w), max(high, w)
-    return low + share * (high - low)
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def read_depth(depth, inverse, cosines, edges, hidden, albedo, draws, parameters):
-    """(H, W) readings of a true depth image, pixel by pixel."""
-    axial, lateral, uniform = draws
-    height, width = depth.shape
-    out = np.zeros((height, width), np.float32)
+    out = np.empty((height, width), np.int32)
     for v in range(height):
         for u in range(width):
-            row, column = v, u
-            if parameters.lateral > 0:
-                row, column = _source(v, u, cosines, edges, lateral, parameters)
-            w = inverse[row, column]
-            if w == 0.0 or hidden[row, column] or inverse[v, u] == 0.0:
+            word = bits[v, u]
+            sigma = p.lateral_sigma
+            if p.lateral_grazing > 0.0 and (everywhere or edges[v, u]):
+                theta = min(np.arccos(cosines[v, u]), p.max_incidence)
+                sigma += p.lateral_grazing * theta / (_HALF_PI - theta)
+            row = min(max(v + _shift(quantiles[word & 4095], sigma), 0), height - 1)
+            column = min(max(u + _shift(quantiles[(word >> 12) & 4095], sigma), 0), width - 1)
+            moved = everywhere or edges[v, u] or edges[row, column]
+            out[v, u] = row * width + column if moved else v * width + u
+    return out
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _kept(z, cosine, albedo, p):
+    """Probability that a reading is not lost to incidence, darkness or chance; no albedo is a negative one."""
+    keep = np.float32(1.0) - p.dropout
+    if cosine < p.grazing_cosine:
+        keep /= np.float32(1.0) + np.exp((np.arccos(cosine) - p.grazing_dropout) / p.grazing_width)
+    if albedo >= 0.0 and p.albedo_floor > 0.0:
+        ratio = p.albedo_floor * z * z / max(albedo, np.float32(1e-6))
+        keep /= np.float32(1.0) + ratio * ratio
+    return keep
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _axial(z, cosine, p):
+    """Standard deviation of what is added to z before rounding: that of the whole reading without rounding's share."""
+    sigma = p.axial_offset + p.axial_quadratic * (z - p.axial_origin) * (z - p.axial_origin)
+    if p.axial_grazing > 0.0 and cosine < np.float32(0.5):  # beyond 60 deg
+        theta = min(np.arccos(cosine), p.max_incidence)
+        ratio = theta / (_HALF_PI - theta)
+        sigma += p.axial_grazing / np.sqrt(z) * ratio * ratio
+    rounding = p.disparity_step * z * z
+    return np.sqrt(max(sigma * sigma - rounding * rounding / np.float32(12.0), np.float32(0.0)))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _handa(z, normal):
+    """Depth by the last step of Handa et al. (see `DepthNoiseConfig.simkinect`)."""
+    centimetres = np.rint(np.float32(100.0) * z)
+    levels = np.rint(np.float32(35130.0) / centimetres + normal / np.float32(6.0) + np.float32(0.5))
+    return np.float32(351.30) / levels if centimetres > 0.0 and levels > 0.0 else np.float32(0.0)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def fly(inverse, edges, uniform, share):
+    """(H, W) inverse depth in which a share of the pixels at edges lies between the surfaces around them."""
+    height, width = inverse.shape
+    out = inverse.copy()
+    for v in range(1, height - 1):
+        for u in range(1, width - 1):
+            if not edges[v, u] or uniform[v, u] >= share or inverse[v, u] == 0.0:
                 continue
-            z = depth[row, column]
-            if parameters.flying_pixels > 0.0 and edges[v, u] and uniform[v, u, 1] < parameters.flying_pixels:
-                z = np.float32(1.0) / _mixed(v, u, inverse, uniform[v, u, 1] / np.float32(parameters.flying_pixels))
-            dark = albedo[row, column] if albedo.shape[0] > 0 else np.float32(-1.0)
-            if _lost(z, cosines[row, column], uniform[v, u, 0], dark, parameters):
-                continue
-            normal = axial[v, u] if axial.shape[0] > 0 else np.float32(0.0)
-            if not parameters.simkinect:
-                z += normal * _axial(z, cosines[row, column], parameters)
-            if z > 0.0:
-                z = _round(z, parameters.disparity_step, parameters.simkinect, normal)
-                if parameters.limits[0] <= z <= parameters.limits[1]:
-                    out[v, u] = z
+            low = high = inverse[v, u]
+            for row in range(v - 1, v + 2):
+                for column in range(u - 1, u + 2):
+                    w = inverse[row, column]
+                    if w > 0.0:
+                        low, high = min(low, w), max(high, w)
+            out[v, u] = low + uniform[v, u] / np.float32(share) * (high - low)
+    return out
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def read_depth(inverse, cosines, hidden, source, albedo, axial, uniform, simkinect, p):
+    """Readings of N pixels, all arguments flat; `albedo`, `axial` and `source` may be empty."""
+    out = np.zeros(inverse.shape[0], np.float32)
+    scale = np.float32(1.0) / p.disparity_step
+    for i in range(inverse.shape[0]):
+        j = np.int64(source[i]) if source.shape[0] > 0 else i
+        if inverse[j] == 0.0 or inverse[i] == 0.0 or hidden[j]:
+            continue
+        z = np.float32(1.0) / inverse[j]
+        cosine = cosines[j]
+        if uniform[i] >= _kept(z, cosine, albedo[j] if albedo.shape[0] > 0 else np.float32(-1.0), p):
+            continue
+        normal = axial[i] if axial.shape[0] > 0 else np.float32(0.0)
+        if not simkinect:
+            z += normal * _axial(z, cosine, p)
+        if p.disparity_step > 0.0 and z > 0.0:
+            z = scale / max(np.rint(scale / z), np.float32(1.0))
+        if simkinect:
+            z = _handa(z, normal)
+        if p.min_range <= z <= p.max_range:
+            out[i] = z
     return out

@@ -8,12 +8,16 @@ and SLAM*, ICRA 2014 (simkinect). What is marked as a choice of this project has
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from simtrack.contracts import CameraIntrinsics, Float32, Float64
 from simtrack.errors import InvalidValueError, UnknownNameError
+
+if TYPE_CHECKING:
+    from simtrack.sensors.depth_kernels import Parameters
 
 LATERAL_MODES = ("none", "edges", "everywhere")
 """Where pixels read the depth of a neighbour."""
@@ -64,7 +68,7 @@ class DepthNoiseConfig:
     grazing_width: float = np.deg2rad(1.5)
     """Radians over which that loss sets in (logistic). A choice of this project."""
     albedo_floor: float = 0.04
-    """Infrared albedo at which half of the readings at `max_range` are lost; the limit falls with the square of the
+    """Infrared albedo at which half of the readings at `max_range` are lost; that albedo falls with the square of the
     depth. Needs an albedo image; 0 = off. A choice of this project."""
     dropout: float = 0.0005
     """Share of readings lost for no reason. A choice of this project."""
@@ -199,50 +203,66 @@ def apply_depth_noise(
     ):
         if array is not None and array.shape != wanted:
             raise InvalidValueError(name, array.shape, f"shape {wanted}, as the intrinsics say")
-    draws = _draw(shape, config, rng)
+    axial, shifts, uniform = _draw(shape, config, rng)
+    parameters = _kernel_parameters(config)
     camera = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
     inverse = kernels.inverse_depth(depth)
     if normals is None:
         cosines = kernels.cosines_from_depth(inverse, *camera)
     else:
         cosines = kernels.cosines_from_normals(np.ascontiguousarray(normals, np.float32), *camera)
-    disparity = config.focal * config.quantisation_baseline
-    edges = kernels.depth_edges(inverse, np.float32(config.edge_disparity / disparity))
+    hidden, source, dark = np.zeros(shape, np.bool_), np.empty(0, np.int32), np.empty(0, np.float32)
     if config.shadow_baseline > 0:
         hidden = kernels.projector_shadow(inverse, np.float32(intrinsics.fx * config.shadow_baseline))
-    else:
-        hidden = np.zeros(shape, np.bool_)
-    dark = np.empty((0, 0), np.float32) if albedo is None else np.ascontiguousarray(albedo, np.float32)
-    parameters = kernels.Parameters(
-        axial=np.array([config.axial_offset, config.axial_quadratic, config.axial_origin, config.axial_grazing], "f4"),
-        max_incidence=config.max_incidence,
-        lateral=LATERAL_MODES.index(config.lateral),
-        lateral_sigma=np.array([config.lateral_sigma, config.lateral_grazing], np.float32),
-        disparity_step=config.disparity_step / disparity,
-        grazing=np.array([config.grazing_dropout, config.grazing_width], np.float32),
-        albedo_floor=config.albedo_floor,
-        dropout=config.dropout,
-        flying_pixels=config.flying_pixels,
-        simkinect=config.simkinect,
-        limits=np.array([config.min_range, config.max_range], np.float32),
-    )
-    return kernels.read_depth(depth, inverse, cosines, edges, hidden, dark, draws, parameters)
+    if config.lateral != "none" or config.flying_pixels > 0:
+        threshold = np.float32(config.edge_disparity / (config.focal * config.quantisation_baseline))
+        edges = kernels.depth_edges(inverse, threshold)
+        if config.lateral != "none":
+            everywhere = config.lateral == "everywhere"
+            source = kernels.sources(cosines, edges, shifts, kernels.normal_quantiles(), everywhere, parameters).ravel()
+        if config.flying_pixels > 0:
+            inverse = kernels.fly(inverse, edges, uniform[1], config.flying_pixels)
+    if albedo is not None:
+        dark = np.ascontiguousarray(albedo, np.float32).ravel()
+    flat = (inverse.ravel(), cosines.ravel(), hidden.ravel(), source, dark, axial.ravel(), uniform[0].ravel())
+    return kernels.read_depth(*flat, config.simkinect, parameters).reshape(shape)
 
 
-def _draw(shape: tuple[int, int], config: DepthNoiseConfig, rng: np.random.Generator) -> tuple[Float32, ...]:
-    """Standard normal axial noise (H, W), lateral shifts (H, W, 2), uniform numbers (H, W, 2); only what is used."""
+def _kernel_parameters(config: DepthNoiseConfig) -> "Parameters":
+    from simtrack.sensors.depth_kernels import Parameters
+
+    grazing_cosine = np.cos(config.grazing_dropout - 8.0 * config.grazing_width)
+    return Parameters(
+        *np.array(
+            [
+                config.axial_offset, config.axial_quadratic, config.axial_origin, config.axial_grazing,
+                config.max_incidence, config.lateral_sigma, config.lateral_grazing,
+                config.disparity_step / (config.focal * config.quantisation_baseline),
+                config.grazing_dropout, config.grazing_width,
+                grazing_cosine if config.grazing_dropout < np.pi / 2 else -1.0,
+                config.albedo_floor / config.max_range**2, config.dropout, config.flying_pixels,
+                config.min_range, config.max_range,
+            ],
+            np.float32,
+        )
+    )  # fmt: skip
+
+
+def _draw(
+    shape: tuple[int, int], config: DepthNoiseConfig, rng: np.random.Generator
+) -> tuple[Float32, npt.NDArray[np.uint32], Float32]:
+    """Axial noise (H, W) of unit variance, random bits (H, W) for lateral shifts, uniform numbers (1 or 2, H, W)."""
     from simtrack.sensors import depth_kernels as kernels
 
-    nothing = np.zeros((0, 0), np.float32)
-    axial = nothing
+    axial = np.zeros((0, 0), np.float32)
     if config.simkinect or config.axial_offset or config.axial_quadratic or config.axial_grazing:
         axial = rng.standard_normal(shape, dtype=np.float32)
         if config.correlated_share > 0 and config.correlation_window > 1:
+            # A weighted sum of this many uniform numbers is normal for all purposes, and they are cheaper to draw.
             pad = config.correlation_window - 1
-            white = rng.standard_normal((shape[0] + pad, shape[1] + pad), dtype=np.float32)
+            white = rng.random((shape[0] + pad, shape[1] + pad), dtype=np.float32)
             kernels.blend_correlated(axial, white, kernels.window(config.correlation_window), config.correlated_share)
-    lateral = nothing.reshape(0, 0, 1)
+    shifts = np.zeros((0, 0), np.uint32)
     if config.lateral != "none":
-        lateral = rng.standard_normal((*shape, 2), dtype=np.float32)
-    uniform = rng.random((*shape, 2), dtype=np.float32)
-    return axial, lateral, uniform
+        shifts = rng.integers(1 << 32, size=shape, dtype=np.uint32)
+    return axial, shifts, rng.random((2 if config.flying_pixels > 0 else 1, *shape), dtype=np.float32)
