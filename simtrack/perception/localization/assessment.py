@@ -1,12 +1,16 @@
 """How well a pose explains a measurement, judged by what a ray of the sensor must and must not pass."""
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from simtrack.contracts import Float64
 from simtrack.perception.localization.measurement import Measurement
 from simtrack.perception.localization.surface import MapSurface
+
+Verdicts: TypeAlias = npt.NDArray[np.int8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,8 +23,9 @@ class Assessment:
     """Share explained among the shots that no level surface explains: floors and ceilings look alike everywhere."""
     through: float
     """Share, of the same, that reach through surfaces of the map: evidence against the pose, unlike things in front."""
-    shots: int
-    """Number of shots that no level surface explains."""
+    verdicts: Verdicts
+    """(N,), one a shot: 2 explained, 0 something is in front of the map or the map has nothing there, -1 the shot
+    reaches through the map."""
 
     @property
     def score(self) -> float:
@@ -37,11 +42,39 @@ def assess(measurement: Measurement, surface: MapSurface, T_map_base: Float64, t
     from simtrack.perception.localization.kernels import explain
 
     if not len(measurement):
-        return Assessment(0.0, 0.0, 0.0, 0)
+        return UNJUDGED
     hits = surface.cast(T_map_base, measurement)
     directions = measurement.directions @ T_map_base[:3, :3].T
     cosines = np.einsum("ij,ij->i", hits.normals, directions)
     kinds = explain(measurement.ranges, measurement.sigmas, hits.distances, hits.normals, cosines, tolerance)
     level, structure, _, through, _ = np.bincount(kinds, minlength=5)
     rest = max(len(kinds) - int(level), 1)
-    return Assessment((int(level) + int(structure)) / len(kinds), int(structure) / rest, int(through) / rest, rest)
+    verdicts = np.array([2, 2, 0, -1, 0], np.int8)[kinds]
+    return Assessment((int(level) + int(structure)) / len(kinds), int(structure) / rest, int(through) / rest, verdicts)
+
+
+def lead(a: list[Verdicts], b: list[Verdicts]) -> tuple[float, float]:
+    """How clearly pose `a` explains the same scans better than pose `b`, judged by the shots on which they differ.
+
+    Most of a scan often fits both (the walls of a corridor): the sign test of the rest tells them apart.
+
+    Args:
+        a: verdicts, one (N,) array a scan.
+        b: of the same scans, newest last; the longer list is cut at its front.
+
+    Returns:
+        (wins - losses) / (wins + losses) in -1..1, and the share of the shots on which they differ.
+    """
+    wins, losses, differing, shots = 0, 0, 0, 0
+    count = min(len(a), len(b))
+    for first, second in zip(a[len(a) - count :], b[len(b) - count :], strict=True):
+        margin = first.astype(np.int64) - second
+        wins += int(margin[margin > 0].sum())
+        losses -= int(margin[margin < 0].sum())
+        differing += int(np.count_nonzero(margin))
+        shots += len(margin)
+    return (wins - losses) / max(wins + losses, 1), differing / max(shots, 1)
+
+
+UNJUDGED = Assessment(0.0, 0.0, 0.0, np.zeros(0, np.int8))
+"""Of an empty measurement."""

@@ -116,7 +116,9 @@ class SearchConfig:
     def __post_init__(self) -> None:
         _positive(self, "resolution", "sigma", "coarse_cell", "coarse_yaw", "max_range", "clearance")
         if len(self.points) != self.levels or len(self.beam) != self.levels:
-            raise InvalidValueError("SearchConfig.points, beam", (self.points, self.beam), f"{self.levels} entries each")
+            raise InvalidValueError(
+                "SearchConfig.points, beam", (self.points, self.beam), f"{self.levels} entries each"
+            )
         if len(self.heights) < 2 or list(self.heights) != sorted(self.heights):
             raise InvalidValueError("SearchConfig.heights", self.heights, "two or more ascending heights")
 
@@ -125,7 +127,7 @@ class SearchConfig:
 class RecoveryConfig:
     """When the pose counts as lost, and what it takes to believe a new one."""
 
-    collapse: float = 0.6
+    collapse: float = 0.7
     """Lost if the explained share of the structure falls below this share of its running level ..."""
     collapse_scans: int = 3
     """... in so many consecutive scans."""
@@ -137,10 +139,12 @@ class RecoveryConfig:
     """rad, likewise."""
     accept_share: float = 0.55
     """Explained share of the structure that a found pose must reach."""
-    accept_gap: float = 0.08
-    """Lead over the best distinct rival, mean over its scans, that a found pose needs after some travel."""
-    accept_gap_still: float = 0.2
-    """Likewise before that travel."""
+    accept_lead: float = 0.3
+    """(wins - losses) / (wins + losses) over every rival, on the shots that tell them apart, after some travel ..."""
+    accept_lead_still: float = 0.6
+    """... and before that travel."""
+    min_difference: float = 0.01
+    """Two poses whose explanations of the scans differ in a smaller share of the shots cannot be told apart."""
     accept_scans: int = 6
     """Scans over which a found pose must lead."""
     accept_travel: float = 1.0
@@ -163,6 +167,10 @@ class LocalizerConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
+    trusted_sigma: float = 0.1
+    """m: a start pose that is surer than this ..."""
+    trusted_sigma_yaw: float = 0.05
+    """rad: ... and this is tracked from at once, if the first scan agrees with it; otherwise it is searched around."""
     initial_sigma: float = 0.25
     """m: standard deviation of a start pose that is given without covariance."""
     initial_sigma_yaw: float = 0.1
@@ -177,4 +185,6 @@ class LocalizerConfig:
     """m."""
 
     def __post_init__(self) -> None:
-        _positive(self, "initial_sigma", "initial_sigma_yaw", "min_range", "max_range", "depth_stride", "depth_max_range")
+        _positive(
+            self, "initial_sigma", "initial_sigma_yaw", "min_range", "max_range", "depth_stride", "depth_max_range"
+        )

@@ -1,6 +1,7 @@
-"""Range measurements in the form that registration takes: shots with own origins, all in the base frame of one stamp."""
+"""Range measurements as registration takes them: shots with own origins, all in the base frame of one stamp."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -40,7 +41,12 @@ class Measurement:
             return self
         take = slice(None, None, stride)
         return Measurement(
-            self.stamp, self.origins[take], self.directions[take], self.ranges[take], self.sigmas[take], self.shots[take]
+            self.stamp,
+            self.origins[take],
+            self.directions[take],
+            self.ranges[take],
+            self.sigmas[take],
+            self.shots[take],
         )
 
 
@@ -86,7 +92,7 @@ def deskew(
     stamps, poses = odometry.knots(scan.stamp, end)
     T_end_odom = inverse(poses[-1])
     knots = np.stack([T_end_odom @ T for T in poses])
-    turns = np.stack([log_so3(b[:3, :3] @ a[:3, :3].T) for a, b in zip(knots[:-1], knots[1:], strict=True)] or [np.zeros(3)])
+    turns = np.stack([log_so3(b[:3, :3] @ a[:3, :3].T) for a, b in pairwise(knots)] or [np.zeros(3)])
     knot_times = np.array([(stamp - scan.stamp) / NANOSECONDS for stamp in stamps])
     origins, directions = deskew_shots(
         np.ascontiguousarray(scan.directions, dtype=np.float64),

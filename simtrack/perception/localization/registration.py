@@ -75,7 +75,9 @@ def register(
         T_cast = T
         for _ in range(config.inner_iterations):
             kernel = _kernel(T, points, planes, gate, config)
-            info, gradient, map_info, feigned, stats = _normal_equations(T, points, planes, weights, map_weights, kernel)
+            info, gradient, map_info, feigned, stats = _normal_equations(
+                T, points, planes, weights, map_weights, kernel
+            )
             observed = _observed(info, feigned, stats, config)
             info, gradient = _symmetric(observed.restrict(info)), observed.restrict(gradient)
             A = info + prior + upright
