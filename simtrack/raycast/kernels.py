@@ -137,14 +137,6 @@ def _new_packet(lanes, near, time, coherent):
 
 
 @nb.njit(cache=True, nogil=True)
-def _intersect(lanes, valid, scene, packet, query):
-    if len(lanes) == 16:
-        _rtcIntersect16(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
-    else:
-        _rtcIntersect8(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
-
-
-@nb.njit(cache=True, nogil=True)
 def _occlude(lanes, valid, scene, packet, query):
     if len(lanes) == 16:
         _rtcOccluded16(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
@@ -153,10 +145,20 @@ def _occlude(lanes, valid, scene, packet, query):
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _turn_normals(lanes, packet, m, first, last):
-    """Normals of some lanes, in place: mesh frame, any length -> map frame, unit."""
+def _turn_mixed(lanes, packet, integers, table):
+    """Normals of a packet whose lanes met different instances, moving ones or nothing, in place."""
     width = len(lanes)
-    for k in range(first, last):
+    for k in range(width):
+        instance = integers[19 * width + k]
+        if instance < 0:
+            packet[8 * width + k] = np.inf
+            integers[17 * width + k] = -1
+            for axis in range(3):
+                packet[(12 + axis) * width + k] = 0.0
+            continue
+        m = table.normal[instance]
+        if table.key_count[instance] > 1:
+            m = _moving_normal_matrix(table, instance, packet[7 * width + k])
         a, b, c = packet[12 * width + k], packet[13 * width + k], packet[14 * width + k]
         x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c
         y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c
@@ -167,56 +169,72 @@ def _turn_normals(lanes, packet, m, first, last):
         packet[14 * width + k] = z * scale
 
 
-@nb.njit(cache=True, nogil=True)
-def _read(lanes, packet, integers, order, base, table, out):
-    """Copy the hits of one packet to the outputs, normals turned into the map frame."""
+@nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _read(lanes, packet, integers, order, base, table, turn, resting, distances, normals, faces, instances):
+    """Copy the hits of one packet to the outputs, normals turned into the map frame.
+
+    Inlined and on plain arrays: array arguments of a call, and fields of a tuple, are reference-counted each time.
+    """
     width = len(lanes)
-    instance = integers[19 * width]
-    uniform = instance >= 0
+    first = integers[19 * width]
+    uniform = first >= 0 and resting[first] == 1
     for k in range(width):
-        uniform &= integers[19 * width + k] == instance
-    if uniform and table.key_count[instance] == 1:  # nearly always, and then one vector loop does
-        _turn_normals(lanes, packet, table.normal[instance], 0, width)
-    else:
+        uniform &= integers[19 * width + k] == first
+    if uniform:  # nearly always, and then one vector loop does
+        xx, xy, xz = turn[first, 0, 0], turn[first, 0, 1], turn[first, 0, 2]
+        yx, yy, yz = turn[first, 1, 0], turn[first, 1, 1], turn[first, 1, 2]
+        zx, zy, zz = turn[first, 2, 0], turn[first, 2, 1], turn[first, 2, 2]
         for k in range(width):
-            instance = integers[19 * width + k]
-            if instance < 0:
-                packet[8 * width + k] = np.inf
-                integers[17 * width + k] = -1
-                for axis in range(3):
-                    packet[(12 + axis) * width + k] = 0.0
-            elif table.key_count[instance] > 1:
-                turn = _moving_normal_matrix(table, instance, packet[7 * width + k])
-                _turn_normals(lanes, packet, turn, k, k + 1)
-            else:
-                _turn_normals(lanes, packet, table.normal[instance], k, k + 1)
+            a, b, c = packet[12 * width + k], packet[13 * width + k], packet[14 * width + k]
+            x = xx * a + xy * b + xz * c
+            y = yx * a + yy * b + yz * c
+            z = zx * a + zy * b + zz * c
+            scale = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
+            packet[12 * width + k] = x * scale
+            packet[13 * width + k] = y * scale
+            packet[14 * width + k] = z * scale
+    else:
+        _turn_mixed(lanes, packet, integers, table)
     for k in range(width):
         ray = np.uint32(order[base + k])
-        out.distances[ray] = packet[8 * width + k]
-        out.faces[ray] = integers[17 * width + k]
-        out.instances[ray] = integers[19 * width + k]
-        for axis in range(3):
-            out.normals[ray, axis] = packet[(12 + axis) * width + k]
+        distances[ray] = packet[8 * width + k]
+        faces[ray] = integers[17 * width + k]
+        instances[ray] = integers[19 * width + k]
+        normals[ray, 0] = packet[12 * width + k]
+        normals[ray, 1] = packet[13 * width + k]
+        normals[ray, 2] = packet[14 * width + k]
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _bundle_chunk(chunk, lanes, scene, bundle, near, far, table, out):
+    width = len(lanes)
     packet, integers, valid, query = _new_packet(lanes, near, bundle.time, True)
+    # Addresses as numbers; the arrays live until the end of the function because the loop uses them.
+    p_valid, p_packet, p_query = valid.ctypes.data, packet.ctypes.data, query.ctypes.data
+    packed, order, rotation = bundle.packed, bundle.order, bundle.rotation
+    turn, resting = table.normal, table.key_count
+    distances, normals, faces, instances = out
     for axis in range(3):
-        for k in range(len(lanes)):
-            packet[axis * len(lanes) + k] = bundle.origin[axis]
-    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, bundle.packed.shape[0])):
+        for k in range(width):
+            packet[axis * width + k] = bundle.origin[axis]
+    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, packed.shape[0])):
         for axis in range(3):
-            r0, r1, r2 = bundle.rotation[axis, 0], bundle.rotation[axis, 1], bundle.rotation[axis, 2]
-            for k in range(len(lanes)):
-                x, y, z = bundle.packed[block, 0, k], bundle.packed[block, 1, k], bundle.packed[block, 2, k]
-                packet[(4 + axis) * len(lanes) + k] = r0 * x + r1 * y + r2 * z
-        for k in range(len(lanes)):
-            packet[8 * len(lanes) + k] = far
-            integers[18 * len(lanes) + k] = -1
-            integers[19 * len(lanes) + k] = -1
-        _intersect(lanes, valid, scene, packet, query)
-        _read(lanes, packet, integers, bundle.order, block * len(lanes), table, out)
+            r0, r1, r2 = rotation[axis, 0], rotation[axis, 1], rotation[axis, 2]
+            for k in range(width):
+                packet[(4 + axis) * width + k] = (
+                    r0 * packed[block, 0, k] + r1 * packed[block, 1, k] + r2 * packed[block, 2, k]
+                )
+        for k in range(width):
+            packet[8 * width + k] = far
+            integers[18 * width + k] = -1
+            integers[19 * width + k] = -1
+        if width == 16:
+            _rtcIntersect16(p_valid, scene, p_packet, p_query)
+        else:
+            _rtcIntersect8(p_valid, scene, p_packet, p_query)
+        base = block * width
+        _read(lanes, packet, integers, order, base, table, turn, resting, distances, normals, faces, instances)
+    return valid[0] + np.int32(query[0])  # keeps both alive
 
 
 @nb.njit(cache=True, nogil=True)
@@ -240,13 +258,22 @@ def _load(lanes, packet, integers, valid, rays, base, far):
         valid[k] = -1 if poison == 0.0 and length > 0.0 else 0
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _rays_chunk(chunk, lanes, scene, rays, near, far, coherent, table, out):
+    width = len(lanes)
     packet, integers, valid, query = _new_packet(lanes, near, np.float32(0.0), coherent)
-    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, rays.order.shape[0] // len(lanes))):
-        _load(lanes, packet, integers, valid, rays, block * len(lanes), far)
-        _intersect(lanes, valid, scene, packet, query)
-        _read(lanes, packet, integers, rays.order, block * len(lanes), table, out)
+    p_valid, p_packet, p_query = valid.ctypes.data, packet.ctypes.data, query.ctypes.data
+    order, turn, resting = rays.order, table.normal, table.key_count
+    distances, normals, faces, instances = out
+    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, order.shape[0] // width)):
+        base = block * width
+        _load(lanes, packet, integers, valid, rays, base, far)
+        if width == 16:
+            _rtcIntersect16(p_valid, scene, p_packet, p_query)
+        else:
+            _rtcIntersect8(p_valid, scene, p_packet, p_query)
+        _read(lanes, packet, integers, order, base, table, turn, resting, distances, normals, faces, instances)
+    return valid[0] + np.int32(query[0])  # keeps both alive
 
 
 @nb.njit(cache=True, nogil=True)
