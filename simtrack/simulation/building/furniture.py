@@ -32,6 +32,9 @@ FINISHES: tuple[Color, ...] = (BEECH, OAK, WHITE, GREY, STEEL)
 FABRICS: tuple[Color, ...] = (BLACK, BLUE, GREY, RED, GREEN)
 
 
+_UNIT_BOX = box_mesh((1.0, 1.0, 1.0))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Furniture:
     """A piece of furniture in its own frame: origin in the centre of its box, x to its front, z up."""
@@ -97,12 +100,13 @@ class Assembly:
         """Move everything into the frame of the common box."""
         mesh = concatenate(self.meshes)
         low, high = mesh.bounds
-        shift = transform(None, -(low + high) / 2)
+        centre = (low + high) / 2
+        shift = transform(None, -centre)
         return Furniture(
             semantic_class=self.semantic_class,
-            mesh=transformed(mesh, shift),
+            mesh=Mesh(mesh.vertices - centre, mesh.faces, mesh.face_colors),
             extents=high - low,
-            centre=(low + high) / 2,
+            centre=centre,
             supports=tuple((shift @ T, size) for T, size in self.supports),
             collision=tuple((shift @ T, size) for T, size in self.solids),
             survey=survey,
@@ -112,8 +116,9 @@ class Assembly:
 
 def block(low: Point, high: Point, color: Color) -> Mesh:
     """Closed axis-aligned box between two corners."""
-    a, b = np.array(low), np.array(high)
-    return transformed(box_mesh(b - a, color), transform(None, (a + b) / 2))
+    corner = np.array(low)
+    vertices = corner + (_UNIT_BOX.vertices + 0.5) * (np.array(high) - corner)
+    return Mesh(vertices, _UNIT_BOX.faces, np.full((12, 3), color, np.uint8))
 
 
 def legs(a: Assembly, size: tuple[float, float, float], thickness: float, color: Color) -> None:

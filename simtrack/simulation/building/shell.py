@@ -60,7 +60,7 @@ class Sheet:
 
     def count(self, edge: float) -> int:
         """Number of triangles if no edge along x or y is longer than `edge` metres."""
-        return 2 * int(_steps(self.x, edge) @ self.filled @ _steps(self.y, edge))
+        return 2 * int(_steps(self.x, edge) @ (self.filled @ _steps(self.y, edge)))
 
     def mesh(self, edge: float) -> Mesh:
         """Tessellation in the map frame with no edge along x or y longer than `edge` metres."""
@@ -78,7 +78,7 @@ class Sheet:
 
 
 def _steps(breaks: Float64, edge: float) -> np.ndarray:
-    return np.maximum(np.ceil(np.diff(breaks) / edge - 1e-9), 1).astype(np.int64)
+    return np.maximum(np.ceil((breaks[1:] - breaks[:-1]) / edge - 1e-9), 1.0).astype(np.int64)
 
 
 def _refined(breaks: Float64, edge: float) -> Float64:
