@@ -1,10 +1,10 @@
 """Oriented boxes: signed distance, closest and farthest points, containment; exact, compiled, no iteration.
 
-A box is a pose `T_map_box` (origin in the box's centre) and full side lengths. The signed distance of two boxes is their
-Euclidean distance when they are apart and minus the penetration depth (the shortest translation that separates them) when
-they overlap. The depth follows from the fifteen axes of the separating-axis test (S. Gottschalk, M. C. Lin, D. Manocha,
-"OBBTree", SIGGRAPH 1996): the faces of the Minkowski difference of two boxes have no other normals. The distance is
-attained between a corner and a box or between two edges, all of which are tried.
+A box is a pose `T_map_box` (origin in the box's centre) and full side lengths. The signed distance of two boxes is
+their Euclidean distance when they are apart and minus the penetration depth (the shortest translation that separates
+them) when they overlap. The depth follows from the fifteen axes of the separating-axis test (S. Gottschalk, M. C. Lin,
+D. Manocha, "OBBTree", SIGGRAPH 1996): the faces of the Minkowski difference of two boxes have no other normals. The
+distance is attained between a corner and a box or between two edges, all of which are tried.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from simtrack.contracts import Float64
+from simtrack.contracts import Bool, Float64
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import is_rigid
 
@@ -44,10 +44,10 @@ class OrientedBox:
         signs = np.array([[(i >> k & 1) - 0.5 for k in range(3)] for i in range(8)])
         return (signs * self.extents) @ self.T_map_box[:3, :3].T + self.T_map_box[:3, 3]
 
-    def contains(self, points: Float64) -> np.ndarray:
+    def contains(self, points: Float64) -> Bool:
         """(N,) bool: which of (N, 3) map points lie in the closed box."""
         local = (np.asarray(points) - self.T_map_box[:3, 3]) @ self.T_map_box[:3, :3]
-        return (np.abs(local) <= 0.5 * np.asarray(self.extents)).all(axis=-1)
+        return np.all(np.abs(local) <= 0.5 * np.asarray(self.extents), axis=-1)
 
 
 @dataclass(frozen=True, slots=True)

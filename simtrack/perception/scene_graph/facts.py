@@ -1,6 +1,6 @@
 """What a scene graph knows: entities, relations, their history; and the ways to ask it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -70,7 +70,7 @@ class Entity:
 
 
 class SceneFacts:
-    """Entities, relations and history, to be asked; `SceneGraph` keeps them up to date, `load_graph` reads them back."""
+    """Entities, relations, history, to be asked; `SceneGraph` keeps them up to date, `load_graph` reads them back."""
 
     def __init__(
         self,
@@ -165,9 +165,13 @@ class SceneFacts:
                 raise self._unknown(name)
         return self.recorded.intervals(Relation(subject, relation, reference))
 
-    def distance(self, a: str, b: str) -> BoxProximity:
-        """Shortest and longest distance of two entities' boxes, with the points where they are attained."""
-        return proximity(self.entity(a).box, self.entity(b).box)
+    def distance(self, a: str, b: str, measure: Callable[[Entity, Entity], BoxProximity] | None = None) -> BoxProximity:
+        """Shortest and longest distance of two entities, with the points where they are attained.
+
+        Exact for their boxes; `measure` puts in another distance, e.g. one of meshes.
+        """
+        first, second = self.entity(a), self.entity(b)
+        return proximity(first.box, second.box) if measure is None else measure(first, second)
 
     def margin(
         self,

@@ -1,8 +1,8 @@
 """The live scene graph: rooms, static map and believed objects, brought up to date frame by frame.
 
-Only pairs in which something moved are evaluated again. What stands on or in a supporter that moves is carried along until
-it is observed itself: with the pose of the child in its supporter, T_supporter_child = T_map_supporter^-1 T_map_child, kept
-from when both were last seen together, T_map_child = T_map_supporter T_supporter_child (tracking paper, section III.D).
+Only pairs in which something moved are evaluated again. What stands on or in a supporter that moves is carried along
+until it is observed itself: T_supporter_child = T_map_supporter^-1 T_map_child is kept from when the child was last seen,
+and T_map_child = T_map_supporter T_supporter_child since then (tracking paper, section III.D, T_m^c = T_m^t T_t^c).
 """
 
 from collections.abc import Mapping, Sequence
@@ -111,8 +111,8 @@ class SceneGraph(SceneFacts):
     def update(self, stamp: int, tracks: Sequence[Track]) -> frozenset[Relation]:
         """Bring the graph up to date with the tracks of one frame and return the relations that hold.
 
-        Only believed tracks enter; tracks that are not in `tracks` any more leave. A track whose pose is not finite keeps
-        its last one (status DEGRADED). A `stamp` (nanoseconds) that is not newer changes nothing (status STALE).
+        Only believed tracks enter; tracks that are not in `tracks` any more leave. A track whose pose is not finite
+        keeps its last one (status DEGRADED). A `stamp` (nanoseconds) that is not newer changes nothing (status STALE).
 
         Raises:
             UnknownNameError: a track's class is none of the models.
@@ -122,7 +122,7 @@ class SceneGraph(SceneFacts):
             return self.relations
         believed = [track for track in tracks if track.believed]
         poses = np.array([track.T_map_object for track in believed], dtype=float).reshape(-1, 4, 4)
-        finite = np.isfinite(poses).all(axis=(1, 2))
+        finite = np.all(np.isfinite(poses), axis=(1, 2))
         self.status = Status.OK if finite.all() else Status.DEGRADED
         self._require_models(believed)
         self.stamp = stamp

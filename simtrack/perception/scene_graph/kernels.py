@@ -198,7 +198,7 @@ def _smallest(values, rank):
 def _contact_gap(world, body, field, other, first, count):
     """Gap between the cells of one field and the nearest of `count` surfaces of another body.
 
-    It is the gap at the cell that completes the contact area (see `CONTACT_SHARE`), inf if so many cells do not overlap.
+    It is the gap at the cell that completes the contact area (see `CONTACT_SHARE`), inf if fewer cells overlap.
     """
     nu = world.field_shapes[field, 0]
     nv = world.field_shapes[field, 1]

@@ -3,11 +3,11 @@
 SEMAP: H. Deeken et al., "SEMAP - a semantic environment mapping framework", ECMR 2015, as used by the tracking paper,
 section III.D. Every body has its own frame: x points to its front, y to its left, z to its top. For each of the six
 directions a reference has two regions: the half-space beyond the face of its box, and the projection, a box of the same
-cross-section that starts at the face and is 3.5 times as long as the box. Each can be asked strictly (the region contains
-the target's box) or relaxed (it meets it). Where a viewer is given, the reference's frame is replaced by one that looks
-from the viewer to the reference: in front of is towards the viewer, left is the viewer's left.
+cross-section that starts at the face and is 3.5 times as long as the box. Each can be asked strictly (the region
+contains the target's box) or relaxed (it meets it). Where a viewer is given, the reference's frame is replaced by one
+that looks from the viewer to the reference: in front of is towards the viewer, left is the viewer's left.
 
-A margin is the signed distance of a pair from the boundary of a relation, in metres: the relation holds where it is >= 0.
+A margin is the signed distance of a pair from the boundary of a relation, in metres: >= 0 where the relation holds.
 docs/scene_graph.md shows every definition.
 """
 
@@ -255,7 +255,7 @@ def relation_margin(
 def viewer_box(box: OrientedBox, T_map_viewer: Float64) -> OrientedBox:
     """The box around a box whose x axis points horizontally at the viewer; z is up.
 
-    `T_map_viewer` is an optical camera's pose. A viewer straight above takes the upper edge of his image as away from him.
+    `T_map_viewer` is an optical camera's pose. A viewer straight above takes his image's upper edge as away from him.
     """
     towards = T_map_viewer[:2, 3] - box.T_map_box[:2, 3]
     if np.hypot(*towards) < 1e-6:

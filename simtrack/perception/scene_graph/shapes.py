@@ -151,7 +151,8 @@ def _find_interior(highest: Float64, extents: Float64) -> Interior | None:
     from scipy.ndimage import label
 
     low = highest < 0.5 * extents[2] - _BASIN_DEPTH * extents[2]
-    labels = np.asarray(label(np.pad(low, 1, constant_values=True))[0])
+    labels = np.empty((low.shape[0] + 2, low.shape[1] + 2), dtype=np.int32)
+    label(np.pad(low, 1, constant_values=True), output=labels)
     basin = (low & (labels[1:-1, 1:-1] != labels[0, 0])) & np.isfinite(highest)
     if basin.mean() < _BASIN_AREA:
         return None
