@@ -5,7 +5,7 @@ error of the tracker is best read as a multiple of this floor.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -13,6 +13,10 @@ from simtrack.contracts import Float64, RgbdFrame
 from simtrack.evaluation.metrics import Metrics, quantile
 from simtrack.evaluation.pose_errors import PoseScorer
 from simtrack.evaluation.tracking import ObjectFrame
+
+if TYPE_CHECKING:
+    from simtrack.objects import ObjectModel
+    from simtrack.perception.tracking.registration import RegistrationConfig
 
 SMALLEST_FLOOR = 1e-5
 """Metres: a floor below is luck (one draw of the noise that hits the truth), and no ratio is taken against less."""
@@ -28,6 +32,38 @@ class RegistersFromTruth(Protocol):
         occlude each other as they do. Returns name -> (4, 4) T_camera_object for those that could be registered.
         """
         ...
+
+
+class RegistrationFromTruth:
+    """The ray-tracing tracker's registration with the tracker's own models and schedule, in a scene of its own."""
+
+    def __init__(self, models: "Mapping[str, ObjectModel]", config: "RegistrationConfig | None" = None) -> None:
+        """`models`: class name -> the tracker's model."""
+        from simtrack.perception.tracking.registration import Registration
+        from simtrack.perception.tracking.tracker import tracked_model
+
+        self._registration = Registration(config)
+        self._models = {name: tracked_model(model) for name, model in models.items()}
+        self._instances: dict[str, int] = {}
+
+    def __call__(self, frame: RgbdFrame, starts: Mapping[str, tuple[str, Float64]]) -> Mapping[str, Float64]:
+        """See `RegistersFromTruth`."""
+        for name, (class_name, _) in starts.items():
+            if name not in self._instances:
+                self._instances[name] = len(self._instances)
+                self._registration.add(self._instances[name], self._models[class_name])
+        poses = {self._instances[name]: T for name, (_, T) in starts.items()}
+        schedule = self._registration.config.track_schedule
+        results = self._registration.register(frame.depth, frame.intrinsics, poses, schedule=schedule)
+        return {
+            name: results[number].T_camera_object
+            for name, number in self._instances.items()
+            if number in results and results[number].supported
+        }
+
+    def close(self) -> None:
+        """Release the scene."""
+        self._registration.close()
 
 
 class FloorEvaluator:

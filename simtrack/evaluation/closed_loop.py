@@ -1,0 +1,401 @@
+"""The closed loop: simulation -> perception stack -> agent -> simulation, measured on the way.
+
+What counts into the speed: simulating, rendering, the stack, the agent; not the evaluation, which no robot does.
+Frames of the first simulated second are left out: code is compiled and caches fill in it.
+"""
+
+import signal
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from simtrack.contracts import (
+    NANOSECONDS,
+    Agent,
+    Belief,
+    Command,
+    JointState,
+    RgbdFrame,
+    SensorFrame,
+    StaticMap,
+)
+from simtrack.errors import InvalidValueError
+from simtrack.evaluation.evaluator import Evaluator, pose_scorers, true_models
+from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
+from simtrack.evaluation.record import RelationTimeline, RunRecord
+from simtrack.evaluation.run_config import FIXED_GAZE, RunConfig
+from simtrack.evaluation.run_folder import RunFolder
+from simtrack.evaluation.tracking import TrackingEvaluator
+from simtrack.geometry.kinematics import KinematicTree
+from simtrack.objects import ObjectModel
+from simtrack.perception.pipeline import PerceptionStack
+from simtrack.recordings import McapWriter
+from simtrack.simulation.agents import AgentContext, make_agent
+from simtrack.simulation.oracles import OracleDetector
+from simtrack.simulation.randomness import stream
+from simtrack.simulation.simulation import Simulation
+
+SAVE_PERIOD = 5 * NANOSECONDS
+"""Nanoseconds, simulated: metrics and graph are on disk at least this often."""
+WARM_UP = NANOSECONDS
+"""Nanoseconds, simulated, that do not count into the speed."""
+LOOP = ("simulation", "stack", "agent")
+"""What counts into the speed."""
+
+
+class Observer(Protocol):
+    """Somebody who watches a run, such as a viewer."""
+
+    def start(self, static_map: StaticMap, models: Mapping[str, ObjectModel], robot: KinematicTree) -> None:
+        """The run begins."""
+        ...
+
+    def frame(self, frame: SensorFrame, belief: Belief | None) -> None:
+        """One frame and what the stack believes after it, if it was a camera frame."""
+        ...
+
+    def close(self) -> None:
+        """The run is over."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a run is."""
+
+    what: str
+    """Name of the agent that drives."""
+    seconds: float
+    """Simulated so far."""
+    duration: float
+    frames_per_second: float
+    tracks: int
+    """Objects believed now."""
+    localization: str
+    """Its status."""
+
+
+class Clock:
+    """Wall time by what it was spent on."""
+
+    def __init__(self) -> None:
+        self.seconds: defaultdict[str, list[float]] = defaultdict(list)
+        self.total: defaultdict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time a block."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent = time.perf_counter() - start
+            self.seconds[stage].append(spent)
+            self.total[stage] += spent
+
+    @property
+    def loop(self) -> float:
+        """Seconds spent so far on what counts into the speed."""
+        return sum(self.total[stage] for stage in LOOP)
+
+
+class StopSignal:
+    """Turns the first Ctrl-C or kill into the wish to stop at the next frame; the second one ends at once."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._old: dict[signal.Signals, object] = {}
+
+    def __enter__(self) -> "StopSignal":
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._old[number] = signal.signal(number, self._ask)
+        return self
+
+    def _ask(self, number: int, frame: object) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """A simulation with all that closes its loop."""
+
+    simulation: Simulation
+    stack: PerceptionStack
+    agent: Agent
+    start: Command
+    """Held until the agent gives the first one."""
+
+    def drive(
+        self, seconds: float, clock: Clock, log: McapWriter | None = None
+    ) -> Iterator[tuple[SensorFrame, Belief | None]]:
+        """Run for so many simulated seconds; yields every frame as it arrives with what is believed after it.
+
+        A log gets each frame before the stack does, so that the detector's answers follow their images.
+        """
+        command, joints = self.start, JointState(0, (), np.zeros(0))
+        simulation, period = self.simulation, self.simulation.camera_period
+        while simulation.now + period <= round(seconds * NANOSECONDS):
+            want_rgb = self.stack.wants_image(simulation.now + period)
+            with clock("simulation"):
+                frames = simulation.advance(command, want_rgb=want_rgb)
+            for frame in frames:
+                if isinstance(frame, JointState):
+                    joints = frame
+                if log is not None:
+                    log.write(frame, simulation.now)
+                with clock("stack"):
+                    belief = self.stack.process(frame)
+                if belief is not None:
+                    with clock("agent"):
+                        command = self.agent.act(belief, joints)
+                yield frame, belief
+
+
+@contextmanager
+def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
+    """Simulation, stack and agent of a run, wired up; with a log of the feed if the configuration names a file."""
+    with ExitStack() as exits:
+        simulation = exits.enter_context(Simulation(config.scene, config.seed, renderer=config.renderer))
+        robot = config.scene.robot
+        start = Command(head_pan=robot.head_pan, head_tilt=robot.head_tilt, torso=robot.torso)
+        rng = stream(config.seed, "agent")
+        context = AgentContext(simulation.static_map, simulation.robot, simulation.camera.intrinsics, start, rng)
+        stack = PerceptionStack(
+            simulation.static_map,
+            simulation.models,
+            simulation.robot,
+            OracleDetector(simulation.truth, simulation.models, config.seed),
+            T_map_base=simulation.start,
+            config=config.stack,
+        )
+        exits.callback(stack.close)
+        yield Loop(simulation, stack, make_agent(agent, context), start)
+
+
+@dataclass(slots=True)
+class ClosedLoopRun:
+    """One run: drives, measures, writes its folder, and leaves a record for the report."""
+
+    config: RunConfig
+    on_progress: Callable[[Progress], None] = lambda progress: None
+    observers: Sequence[Observer] = ()
+    _clock: Clock = field(default_factory=Clock)
+    _stages: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    _timeline: RelationTimeline = field(default_factory=RelationTimeline)
+    _images: int = 0
+    _steady_from: tuple[int, float] | None = None
+    """Images and seconds of the loop at the end of the warm-up."""
+    _partial: bool = True
+    _gain: Metric = field(default_factory=lambda: unmeasured("1", "the fixed gaze was not run for comparison"))
+
+    def run(self) -> RunRecord:
+        """Run to the end, or until Ctrl-C or a kill: then the record and the metrics say that they are partial.
+
+        Raises:
+            OutputExistsError: the folder exists and may not be overwritten.
+            SimtrackError: something in the scene cannot be used.
+        """
+        config = self.config
+        set_threads(config.threads)
+        with ExitStack() as exits:
+            stop = exits.enter_context(StopSignal())
+            folder = exits.enter_context(RunFolder(config.out, config.scene.name, config.overwrite))
+            folder.write_config(config.resolved())
+            loop = exits.enter_context(closed(config, config.agent_name))
+            log = exits.enter_context(open_log(config, loop)) if config.log is not None else None
+            evaluator = exits.enter_context(Evaluator(loop.simulation, config.stack, config.seconds))
+            for observer in self.observers:
+                observer.start(loop.simulation.static_map, loop.simulation.models, loop.simulation.robot)
+                exits.callback(observer.close)
+            self._follow(loop, evaluator, folder, log, stop)
+            if config.compare_gaze and not stop.asked:
+                self._compare(evaluator, stop)
+            self._partial = stop.asked
+            record = self._record(loop, evaluator)
+            folder.write_metrics(record.metrics)
+            folder.write_graph(loop.stack.graph.to_json())
+        return record
+
+    def _follow(
+        self, loop: Loop, evaluator: Evaluator, folder: RunFolder, log: McapWriter | None, stop: StopSignal
+    ) -> None:
+        saved = 0
+        for frame, belief in loop.drive(self.config.seconds, self._clock, log):
+            if isinstance(frame, RgbdFrame):
+                self._images += 1
+                if self._steady_from is None and frame.stamp >= WARM_UP:
+                    self._steady_from = self._images, self._clock.loop
+            with self._clock("evaluation"):
+                self._measure(loop, evaluator, folder, frame, belief)
+            for observer in self.observers:
+                observer.frame(frame, belief)
+            if loop.simulation.now - saved >= SAVE_PERIOD:
+                saved = loop.simulation.now
+                folder.write_metrics(self._metrics(evaluator))
+                folder.write_graph(loop.stack.graph.to_json())
+            if stop.asked:
+                return
+
+    def _measure(
+        self, loop: Loop, evaluator: Evaluator, folder: RunFolder, frame: SensorFrame, belief: Belief | None
+    ) -> None:
+        objects = evaluator.observe(frame, belief)
+        if belief is None or not evaluator.advanced:
+            return
+        ids = {name: number for number, name in enumerate(sorted(loop.simulation.models), start=1)}
+        localization = belief.localization
+        folder.add_pose(belief.stamp, localization.status.value, evaluator.trajectory.true[-1], localization.T_map_base)
+        folder.add_objects(objects)
+        folder.add_bop(self._images - 1, objects, ids)
+        self._timeline.observe(belief.stamp, belief.relations)
+        for stage, seconds in belief.stage_seconds.items():
+            self._stages[stage].append(seconds)
+        self.on_progress(self._progress(self.config.agent_name, belief))
+
+    def _progress(self, agent: str, belief: Belief) -> Progress:
+        spent = self._clock.loop
+        return Progress(
+            what=agent,
+            seconds=belief.stamp / NANOSECONDS,
+            duration=self.config.seconds,
+            frames_per_second=self._images / spent if spent else 0.0,
+            tracks=sum(track.believed for track in belief.tracks),
+            localization=belief.localization.status.value,
+        )
+
+    def _compare(self, evaluator: Evaluator, stop: StopSignal) -> None:
+        """Run the fixed gaze on the same seed, as far as `world.known_share` needs it."""
+        if self.config.agent_name == FIXED_GAZE:
+            self._gain = unmeasured("1", "this is the fixed gaze itself")
+            return
+        with closed(self.config, FIXED_GAZE) as loop:
+            other = TrackingEvaluator(pose_scorers(true_models(loop.simulation)))
+            last = -1
+            for _, belief in loop.drive(self.config.seconds, Clock()):
+                if stop.asked:
+                    self._gain = unmeasured("1", "the comparison with the fixed gaze was stopped")
+                    return
+                if belief is not None and belief.stamp > last:
+                    last = belief.stamp
+                    other.observe(belief.tracks, loop.simulation.truth.at(last), {})
+                    self.on_progress(self._progress(FIXED_GAZE, belief))
+        ours, theirs = (t.metrics()["world.known_share"].value for t in (evaluator.tracking, other))
+        if ours is not None and theirs is not None:
+            self._gain = measured(ours - theirs, "1")
+
+    # ---------------------------------------------------------------------------------------------------------- results
+
+    def _metrics(self, evaluator: Evaluator) -> Metrics:
+        stamps = evaluator.trajectory.stamps
+        return {
+            **evaluator.metrics(),
+            **self._speed(),
+            "loop.gaze_gain": self._gain,
+            "run.partial": measured(self._partial, "1"),
+            "run.images": measured(self._images, "1"),
+            "run.simulated_time": measured(stamps[-1] / NANOSECONDS if stamps else 0.0, "s"),
+        }
+
+    def _speed(self) -> Metrics:
+        images, seconds = self._steady_from or (0, 0.0)
+        spent = self._clock.loop - seconds
+        missing = "the run was too short"
+        rate = ratio(self._images - images, spent, missing) if self._images > images else unmeasured("Hz", missing)
+        metrics: Metrics = {"speed.frames_per_second": Metric(rate.value, "Hz", rate.reason)}
+        stages = self.stage_seconds()
+        for stage in sorted(stages):
+            metrics[f"speed.stage.{stage}.median"] = quantile(stages[stage], 0.5, "s", missing)
+        everything = sum(self._clock.total.values())
+        metrics["speed.evaluation_share"] = ratio(self._clock.total["evaluation"], everything, missing)
+        metrics["speed.peak_memory"] = peak_memory()
+        return metrics
+
+    def stage_seconds(self) -> dict[str, list[float]]:
+        """Wall time of each stage, one entry a frame in which it worked."""
+        return {**self._stages, "simulation": self._clock.seconds["simulation"], "agent": self._clock.seconds["agent"]}
+
+    def _record(self, loop: Loop, evaluator: Evaluator) -> RunRecord:
+        trajectory, tracking, album = evaluator.trajectory, evaluator.tracking, evaluator.album
+        return RunRecord(
+            scene=self.config.scene.name,
+            seed=self.config.seed,
+            static_map=loop.simulation.static_map,
+            meshes={name: model.visual for name, model in loop.simulation.models.items()},
+            config=self.config.resolved(),
+            start=0,
+            end=trajectory.stamps[-1] if trajectory.stamps else 0,
+            partial=self._partial,
+            metrics=self._metrics(evaluator),
+            stamps=trajectory.stamps,
+            estimated=trajectory.estimated,
+            true=trajectory.true,
+            object_frames=tracking.frames,
+            switches=tracking.switches,
+            false_tracks=tracking.false_tracks,
+            floor=evaluator.floor.samples,
+            stage_seconds=self.stage_seconds(),
+            key_frames=album.key_frames,
+            worst=album.worst,
+            query_frame=album.query_frame,
+            camera=album.camera,
+            lidar=album.lidar,
+            believed_relations=self._timeline.intervals(),
+        )
+
+
+@contextmanager
+def open_log(config: RunConfig, loop: Loop) -> Iterator[McapWriter]:
+    """An MCAP log with all that a replay needs; the stack's detections go into it as they are answered."""
+    assert config.log is not None
+    simulation = loop.simulation
+    metadata = {"scene": config.scene.name, "seed": config.seed, "T_map_base": simulation.start.ravel().tolist()}
+    with McapWriter(
+        config.log,
+        static_map=simulation.static_map,
+        models=simulation.models,
+        robot=simulation.robot,
+        metadata=metadata,
+        overwrite=config.overwrite,
+    ) as log:
+        loop.stack.on_detection = log.write
+        yield log
+
+
+def set_threads(threads: int | None) -> None:
+    """Set the number of threads of compiled kernels; OpenCV gets one, so that bytes repeat."""
+    import cv2
+    import numba
+
+    most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    if threads is not None and not 1 <= threads <= most:
+        raise InvalidValueError("threads", threads, f"1 to {most}")
+    numba.set_num_threads(threads or most)
+    cv2.setNumThreads(1)
+
+
+def peak_memory() -> Metric:
+    """Largest resident memory of this process so far."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="utf-8")
+    except OSError as error:
+        return unmeasured("bytes", f"the system does not tell ({error.strerror})")
+    line = next((line for line in status.splitlines() if line.startswith("VmHWM:")), None)
+    return (
+        unmeasured("bytes", "the system does not tell")
+        if line is None
+        else measured(1024 * int(line.split()[1]), "bytes")
+    )

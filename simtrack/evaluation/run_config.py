@@ -1,0 +1,115 @@
+"""What is to be run, checked before anything is built, and what of it is written down."""
+
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import simtrack
+from simtrack.errors import InvalidValueError, UnknownNameError
+from simtrack.perception.pipeline import StackConfig
+from simtrack.simulation.agents import AGENTS
+from simtrack.simulation.scene_file import SceneFile
+
+DETECTORS = ("oracle",)
+RENDERERS = ("mujoco", "embree")
+DEFAULT_AGENT, FIXED_GAZE = "explorer", "fixed-gaze"
+_PACKAGES = ("mujoco", "numpy", "numba", "embreex", "opencv-python-headless", "scipy", "pyoxigraph")
+
+
+@dataclass(frozen=True, slots=True)
+class RunConfig:
+    """Settings of a run."""
+
+    scene: SceneFile
+    out: Path
+    duration: float | None = None
+    """Simulated seconds; the scene's own if None."""
+    seed: int = 0
+    agent: str | None = None
+    """The scene's own, or the explorer, if None."""
+    detector: str = "oracle"
+    renderer: str = "mujoco"
+    overwrite: bool = False
+    log: Path | None = None
+    """MCAP file to record the sensor feed to."""
+    compare_gaze: bool = False
+    """Run the fixed gaze on the same seed, too."""
+    threads: int | None = None
+    """Threads of the compiled kernels; all that there are if None."""
+    stack: StackConfig = field(default_factory=StackConfig)
+
+    def __post_init__(self) -> None:
+        if self.duration is not None and not 0.0 < self.duration <= 3600.0:
+            raise InvalidValueError("duration", self.duration, "more than 0 and at most 3600 seconds")
+        if self.seed < 0:
+            raise InvalidValueError("seed", self.seed, "0 or a positive integer")
+        for kind, name, known in (
+            ("renderer", self.renderer, RENDERERS),
+            ("detector", self.detector, DETECTORS),
+            ("agent", self.agent_name, AGENTS),
+        ):
+            if name not in known:
+                raise UnknownNameError(kind, name, known)
+
+    @property
+    def seconds(self) -> float:
+        """Simulated seconds."""
+        return self.duration if self.duration is not None else self.scene.duration
+
+    @property
+    def agent_name(self) -> str:
+        """The agent that drives."""
+        return self.agent or self.scene.agent or DEFAULT_AGENT
+
+    def resolved(self) -> dict[str, object]:
+        """Everything that the run depends on, as plain data for YAML: settings, scene, versions, machine."""
+        return {
+            "scene": self.scene.name,
+            "seed": self.seed,
+            "duration": self.seconds,
+            "agent": self.agent_name,
+            "detector": self.detector,
+            "renderer": self.renderer,
+            "threads": self.threads,
+            "scene_file": plain(self.scene.model_dump(mode="json")),
+            "stack": plain(asdict(self.stack)),
+            "versions": versions(),
+            "machine": {"system": platform.platform(), "processor": _processor()},
+        }
+
+
+def versions() -> dict[str, str]:
+    """Versions of simtrack, Python and the packages that results depend on."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    found = {"simtrack": simtrack.__version__, "python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def plain(value: object) -> object:
+    """Nested settings as dicts, lists, strings and numbers."""
+    match value:
+        case Mapping():
+            return {str(key): plain(entry) for key, entry in value.items()}
+        case list() | tuple():
+            return [plain(entry) for entry in value]
+        case set() | frozenset():
+            return sorted(str(entry) for entry in value)
+        case bool() | int() | float() | str() | None:
+            return float(value) if isinstance(value, float) else value
+        case _:
+            return str(value)
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
