@@ -1,6 +1,6 @@
 """What a scene graph knows: entities, relations, their history; and the ways to ask it."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -81,7 +81,7 @@ class SceneFacts:
         rooms: Iterable[Room],
         history: History,
         config: RelationConfig,
-        parents: Mapping[str, str],
+        parents: Mapping[str, Sequence[str]],
         models: Mapping[str, str],
         known: Mapping[str, tuple[str, str, Layer]] | None = None,
     ) -> None:
@@ -91,8 +91,8 @@ class SceneFacts:
         self.recorded = history
         """All intervals and events."""
         self.relation_config = config
-        self.parents = dict(parents)
-        """Taxonomy: semantic class -> its superclass."""
+        self.parents = {name: tuple(above) for name, above in parents.items()}
+        """Taxonomy: semantic class -> its direct superclasses."""
         self.models = dict(models)
         """Object models that there can be instances of: name -> semantic class."""
         self.known = dict(known or {})
@@ -138,13 +138,11 @@ class SceneFacts:
         return self._shapes[name]
 
     def ancestors(self, semantic_class: str) -> tuple[str, ...]:
-        """A semantic class and its superclasses, most special first."""
-        chain: list[str] = []
-        current: str | None = semantic_class
-        while current and current not in chain:
-            chain.append(current)
-            current = self.parents.get(current)
-        return tuple(chain)
+        """A semantic class and all its superclasses, nearer before farther ones."""
+        found = [semantic_class]
+        for known in found:
+            found.extend(above for above in self.parents.get(known, ()) if above not in found)
+        return tuple(found)
 
     # ------------------------------------------------------------------------------------------------------ relations
 
@@ -381,7 +379,7 @@ class SceneFacts:
     def _class_names(self) -> set[str]:
         known = {model for model, _, _ in self.known.values()} | {own for _, own, _ in self.known.values()}
         known |= {*self.models, *self.models.values()}
-        return known | set(self.parents) | set(self.parents.values())
+        return known.union(self.parents, *self.parents.values())
 
     def _require_relation(self, name: str) -> None:
         if name not in RELATIONS:

@@ -1,8 +1,8 @@
 """The live scene graph: rooms, static map and believed objects, brought up to date frame by frame.
 
 Only pairs in which something moved are evaluated again. What stands on or in a supporter that moves is carried along
-until it is observed itself: T_supporter_child = T_map_supporter^-1 T_map_child is kept from when the child was last seen,
-and T_map_child = T_map_supporter T_supporter_child since then (tracking paper, section III.D, T_m^c = T_m^t T_t^c).
+until it is observed itself: T_supporter_child = T_map_supporter^-1 T_map_child is kept from when the child was last
+seen, and T_map_child = T_map_supporter T_supporter_child since then (tracking paper, section III.D, T_m^c = T_m^t T_t^c).
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,7 +59,7 @@ class SceneGraph(SceneFacts):
         static_map: entities and rooms; None for a graph of objects alone.
         models: object models by name, as `Track.class_name` gives it.
         config: settings.
-        parents: background taxonomy, semantic class -> superclass.
+        parents: background taxonomy, semantic class -> direct superclasses (`simtrack.objects.SEMANTIC_CLASSES`).
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class SceneGraph(SceneFacts):
         models: Mapping[str, ModelLike],
         config: SceneGraphConfig | None = None,
         *,
-        parents: Mapping[str, str] | None = None,
+        parents: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         self.config = config or SceneGraphConfig()
         rules = self.config.relations

@@ -1,4 +1,4 @@
-"""The scene graph as JSON: versioned schema, complete, validated when read. docs/scene_graph.md describes every field."""
+"""The scene graph as JSON: versioned schema, complete, validated when read. See docs/scene_graph.md for the fields."""
 
 import json
 from collections.abc import Iterable
@@ -95,7 +95,7 @@ class _Graph(_Model):
     version: Literal[1]
     stamp: int
     config: _Config
-    taxonomy: dict[str, str]
+    taxonomy: dict[str, list[str]]
     models: dict[str, str]
     rooms: list[_Room]
     entities: list[_Entity]
@@ -112,7 +112,7 @@ def dump(facts: SceneFacts) -> str:
         "version": VERSION,
         "stamp": facts.stamp,
         "config": config,
-        "taxonomy": dict(sorted(facts.parents.items())),
+        "taxonomy": {name: list(above) for name, above in sorted(facts.parents.items())},
         "models": dict(sorted(facts.models.items())),
         "rooms": [
             {"name": r.name, "polygon": np.asarray(r.polygon).tolist(), "floor": r.floor, "height": r.height}
