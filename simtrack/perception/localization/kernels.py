@@ -90,6 +90,7 @@ def correspond(
     faces: np.ndarray,
     instances: np.ndarray,
     face_normals: np.ndarray,
+    patches: np.ndarray,
     map_instance: int,
     gate: float,
     pointing_sigma: float,
@@ -98,8 +99,8 @@ def correspond(
 ) -> tuple[Float64, Float64, Float64, Float64, int]:
     """Point-to-plane correspondences along the rays, gated, with their whitening weights.
 
-    A ray's plane passes through the hit of the ray cast from the current estimate. The planes of one face share that
-    face's error (variance `patch_variance`), so n rays on one face together carry no more than 1 / patch_variance:
+    A ray's plane passes through the hit of the ray cast from the current estimate. The planes of one patch of the map
+    share its error (variance `patch_variance`), so n rays on one patch together carry no more than 1 / patch_variance:
     marginalising the shared error of equal Jacobians gives each ray the weight 1 / (sigma^2 + n patch_variance).
 
     Returns:
@@ -108,7 +109,7 @@ def correspond(
     """
     count = ranges.shape[0]
     points, planes = np.empty((count, 3)), np.empty((count, 4))
-    variances, hit_faces = np.empty(count), np.empty(count, np.int64)
+    variances, hit_patches = np.empty(count), np.empty(count, np.int64)
     kept, hits = 0, 0
     R, t = T[:3, :3].copy(), T[:3, 3].copy()
     for i in range(count):
@@ -135,16 +136,16 @@ def correspond(
         planes[kept, 0], planes[kept, 1], planes[kept, 2], planes[kept, 3] = n0, n1, n2, offset
         across = pointing_sigma * ranges[i]
         variances[kept] = sigmas[i] ** 2 * cosine * cosine + across * across * (1.0 - cosine * cosine) + 1e-8
-        hit_faces[kept] = face
-        counts[face] += 1
+        hit_patches[kept] = patches[face]
+        counts[patches[face]] += 1
         kept += 1
     weights, map_weights = np.empty(kept), np.empty(kept)
     for i in range(kept):
-        shared = counts[hit_faces[i]] * patch_variance
+        shared = counts[hit_patches[i]] * patch_variance
         weights[i] = 1.0 / (variances[i] + shared)
         map_weights[i] = 1.0 / max(shared, 1e-12)
     for i in range(kept):
-        counts[hit_faces[i]] = 0
+        counts[hit_patches[i]] = 0
     return points[:kept], planes[:kept], weights, map_weights, hits
 
 

@@ -19,7 +19,7 @@ from simtrack.contracts import (
     Status,
 )
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import difference, interpolate, inverse, is_rigid
+from simtrack.geometry.transforms import difference, interpolate, inverse, is_rigid, rotate_covariance
 from simtrack.perception.localization.assessment import assess
 from simtrack.perception.localization.config import LocalizerConfig
 from simtrack.perception.localization.measurement import Measurement, depth_measurement, deskew, scan_end
@@ -77,6 +77,10 @@ class MeshLocalizer:
         self.config = config or LocalizerConfig()
         self.surface = MapSurface(static_map, scene, map_instance)
         self._lidar_mask, self._depth_mask = lidar_mask, depth_mask
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all that was measured, keep the map: as after construction."""
         self._odometry = OdometryTrack(self.config.motion)
         self._anchors: list[_Anchor] = []
         self._hypotheses = HypothesisSet(self.surface, self.config)
@@ -136,7 +140,7 @@ class MeshLocalizer:
         measurement = deskew(scan, self._odometry, sigma, c.min_range, c.max_range, mask)
         if len(measurement) < c.registration.min_correspondences:
             return self._restated(end, Status.NO_DATA)
-        self._latest = self._recover(measurement) if self._recovering else self._track(measurement)
+        self._latest = self._recover(measurement) if self._recovering else self._track(measurement, scan.stamp)
         return self._latest
 
     def update_depth(self, frame: RgbdFrame) -> Localization:
@@ -173,12 +177,14 @@ class MeshLocalizer:
 
     # ------------------------------------------------------------------------------------------------------ tracking
 
-    def _track(self, measurement: Measurement) -> Localization:
-        """One step of the filter."""
+    def _track(self, measurement: Measurement, scan_start: int) -> Localization:
+        """One step of the filter; the odometry's error over the scan leaves about half of itself in the shots."""
         if not self._trusted:
             return self._look_around(measurement)
         T, P = self._predicted(measurement.stamp)
-        found = register(measurement, self.surface, T, P, self.config.registration)
+        skew = 0.25 * self._odometry.noise(scan_start, measurement.stamp)
+        turned = rotate_covariance(T[:3, :3], skew)
+        found = register(measurement, self.surface, T, P, self.config.registration, systematic=turned)
         judged = assess(measurement.thinned(7), self.surface, found.T_map_base)
         c = self.config.recovery
         if not self._level:  # the first scan from a start pose that was given as sure

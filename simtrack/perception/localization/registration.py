@@ -44,6 +44,7 @@ def register(
     covariance: Float64,
     config: RegistrationConfig,
     T_start: Float64 | None = None,
+    systematic: Float64 | None = None,
     strides: tuple[int, ...] | None = None,
 ) -> Registration:
     """Register a measurement to the map.
@@ -55,6 +56,7 @@ def register(
         covariance: (6, 6) of the prediction.
         config: settings.
         T_start: (4, 4) where to start from, the prediction if None.
+        systematic: (6, 6) covariance, map frame, of errors that the shots share (what de-skewing leaves).
         strides: thinning of the shots, one entry a ray-casting iteration; the config's if None.
     """
     T = np.array(T_prior if T_start is None else T_start)
@@ -93,7 +95,8 @@ def register(
         gate = _clip_gate(2.0 * moved + 3.0 * residual, config, ceiling=gate)
     fused = np.linalg.inv(prior + upright + info)
     if count >= config.min_correspondences:
-        fused = _keep_map_error(fused, map_info, observed, config)
+        own = np.diag([config.systematic_sigma**2] * 3 + [config.systematic_angle**2] * 3)
+        fused = _keep_shared_error(fused, map_info, observed, own if systematic is None else own + systematic)
     converged = count >= config.min_correspondences and moved < 0.5 * config.min_gate
     return Registration(T, _symmetric(fused), converged, count, residual, observed.basis.shape[1], steps)
 
@@ -115,6 +118,7 @@ def _correspondences(
         hits.faces,
         hits.instances,
         surface.normals,
+        surface.patches,
         surface.instance,
         gate,
         config.pointing_sigma,
@@ -183,16 +187,16 @@ def _observed(info: Float64, feigned: Float64, stats: Float64, config: Registrat
     return _Subspace(scale[:, None] * good, good / scale[:, None])
 
 
-def _keep_map_error(covariance: Float64, map_info: Float64, observed: _Subspace, config: RegistrationConfig) -> Float64:
-    """Covariance that is nowhere below what the map's own error leaves.
+def _keep_shared_error(covariance: Float64, map_info: Float64, observed: _Subspace, own: Float64) -> Float64:
+    """Covariance that is nowhere below what the errors leave that no averaging removes.
 
-    The map's error is the same in every scan from about the same place: it must not be averaged away by the filter.
+    The map's error is the same in every scan from about the same place, and the systematic ones (`own`) in every shot:
+    the filter must not average them away.
     """
     basis, dual = observed.basis, observed.dual
     count = basis.shape[1]
     if not count:
         return covariance
-    own = np.diag([config.systematic_sigma**2] * 3 + [config.systematic_angle**2] * 3)
     limit = np.linalg.inv(basis.T @ map_info @ basis + 1e-9 * np.eye(count)) + dual.T @ own @ dual
     root = np.linalg.cholesky(_symmetric(limit))
     inverse_root = np.linalg.inv(root)

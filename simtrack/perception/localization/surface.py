@@ -12,7 +12,9 @@ from simtrack.raycast import RayHits, RayScene, TriangleMesh
 class MapSurface:
     """A static map in a ray-cast scene, which may hold other things too."""
 
-    def __init__(self, static_map: StaticMap, scene: RayScene | None = None, instance: int = 0) -> None:
+    def __init__(
+        self, static_map: StaticMap, scene: RayScene | None = None, instance: int = 0, correlation: float = 0.6
+    ) -> None:
         """Put the map into a scene of its own, or use one that holds it already.
 
         Args:
@@ -20,6 +22,8 @@ class MapSurface:
             scene: a scene that holds the map's mesh in the map frame; other instances in it occlude the map, but the
                 pose is never corrected by them.
             instance: the map's instance id in `scene`.
+            correlation: m, side of the patches of the map whose errors count as one. A surface error with a Gaussian
+                correlation of standard deviation s has one independent value per 2 pi s^2: 2.5 s.
 
         Raises:
             MeshError: the map's mesh is empty or not finite.
@@ -33,10 +37,10 @@ class MapSurface:
         self.scene = scene
         self.instance = instance
         self.normals = smoothed_normals(static_map.vertices, static_map.faces)
-        self.patch_variance = 2.0 * static_map.noise**2
-        """m^2, error of one face's plane. A face stands for half a vertex: independent face errors of twice the
-        vertex variance give averages over a surface the variance that independent vertex errors give them."""
-        self.counts = np.zeros(len(static_map.faces), np.int32)
+        self.patches, count = surface_patches(static_map.vertices, static_map.faces, self.normals, correlation)
+        self.patch_variance = static_map.noise**2
+        """m^2, of the error that a patch's planes share."""
+        self.counts = np.zeros(count, np.int32)
         self.floor = float(np.median([room.floor for room in static_map.rooms])) if static_map.rooms else 0.0
         """m, height of the map's floor."""
 
@@ -44,6 +48,21 @@ class MapSurface:
         """What each shot would have met from `T_map_base`."""
         rotation = T_map_base[:3, :3]
         return self.scene.cast_rays(apply(T_map_base, shots.origins), shots.directions @ rotation.T)
+
+
+def surface_patches(vertices: Float32, faces: Int32, normals: Float64, size: float) -> tuple[Int32, int]:
+    """(F,) number of the patch that each face belongs to, and how many there are.
+
+    Faces share a patch if their centres lie in the same cube of side `size` and they face the same way by and large.
+    """
+    centres = np.asarray(vertices, dtype=np.float64)[faces].mean(axis=1)
+    cells = np.floor((centres - centres.min(axis=0)) / size).astype(np.int64)
+    axis = np.abs(normals).argmax(axis=1)
+    side = 2 * axis + (np.take_along_axis(normals, axis[:, None], axis=1)[:, 0] > 0)
+    extent = cells.max(axis=0) + 1
+    keys = ((cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]) * 6 + side
+    unique, patches = np.unique(keys, return_inverse=True)
+    return patches.astype(np.int32), len(unique)
 
 
 def smoothed_normals(vertices: Float32, faces: Int32, rounds: int = 3, crease: float = 0.8) -> Float64:
