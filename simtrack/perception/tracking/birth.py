@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Float32, Float64, PoseHypothesis
+from simtrack.geometry.transforms import exp_so3
 from simtrack.perception.tracking.registration import (
     Registration,
     RegistrationConfig,
@@ -22,7 +23,7 @@ PROBE = 0
 class FitConfig:
     """When a registered candidate is believed to be there."""
 
-    support: float = 0.62
+    support: float = 0.8
     """Least share of its unoccluded rays that must confirm it."""
     pixels: int = 60
     """Fewest pixels that must confirm it."""
@@ -30,6 +31,10 @@ class FitConfig:
     """Largest RMS residual along the normal, metres, at 1 m distance; grows with its square."""
     constrained: int = 4
     """Fewest directions that the data must constrain."""
+    good_support: float = 0.92
+    """A fit with less support than this is tried again from turned starts."""
+    retry_angle: float = np.deg2rad(14.0)
+    """How far those starts are turned, radians."""
     align_reach: float = 0.3
     """Depth differences up to this are considered when a hypothesis is slid along its viewing ray, metres."""
 
@@ -61,7 +66,9 @@ class Prober:
         schedule = (wide, wide, *registration.schedule)
         probe = replace(registration, schedule=schedule, max_rays=registration.max_rays // 2)
         self._fit = fit
-        self._refine = registration.schedule[1:]
+        self._coarse = [replace(step, repeats=1) for step in (wide, *schedule[:5])]
+        self._refine = schedule[3:]
+        self._follow = registration.track_schedule
         self._registration = Registration(probe)
         self._model: TrackedModel | None = None
 
@@ -77,18 +84,35 @@ class Prober:
         intrinsics: CameraIntrinsics,
     ) -> RegistrationResult | None:
         """Register each alternative and return the one that fits best, or None if none can be believed."""
-        results = [self._settle(h.T_camera_object, model, depth, intrinsics) for h in hypotheses]
-        good = [r for r in results if r is not None and believable(r, self._fit)]
-        return min(good, key=cost, default=None)
+        self._show(model)
+        starts = [self._align_depth(h.T_camera_object, depth, intrinsics) for h in hypotheses]
+        result = self._best_of(starts, depth, intrinsics)
+        if result is None or result.support < self._fit.good_support:
+            turned = [_turned(starts[0], axis, sign * self._fit.retry_angle) for axis in range(3) for sign in (1, -1)]
+            result = min((r for r in (result, self._best_of(turned, depth, intrinsics)) if r), key=cost, default=None)
+        return result if result is not None and believable(result, self._fit) else None
+
+    def _best_of(
+        self, starts: Sequence[Float64], depth: Float32, intrinsics: CameraIntrinsics
+    ) -> RegistrationResult | None:
+        """Register roughly from each start, and the best of them to the end."""
+        rough = [self._register(T, depth, intrinsics, self._coarse) for T in starts]
+        found = min((r for r in rough if r is not None), key=cost, default=None)
+        if found is None:
+            return None
+        return self._register(found.T_camera_object, depth, intrinsics, self._refine)
+
+    def _register(
+        self, T_camera_object: Float64, depth: Float32, intrinsics: CameraIntrinsics, schedule: Sequence[Step]
+    ) -> RegistrationResult | None:
+        return self._registration.register(depth, intrinsics, {PROBE: T_camera_object}, schedule=schedule).get(PROBE)
 
     def follow(
         self, T_camera_object: Float64, model: TrackedModel, depth: Float32, intrinsics: CameraIntrinsics
     ) -> RegistrationResult | None:
         """Register a candidate from a near pose, as the next frame of a track."""
         self._show(model)
-        return self._registration.register(depth, intrinsics, {PROBE: T_camera_object}, schedule=self._refine).get(
-            PROBE
-        )
+        return self._register(T_camera_object, depth, intrinsics, self._follow)
 
     def judge(
         self, T_camera_object: Float64, model: TrackedModel, depth: Float32, intrinsics: CameraIntrinsics
@@ -104,13 +128,6 @@ class Prober:
             self._registration.add(PROBE, model)
             self._model = model
 
-    def _settle(
-        self, T_camera_object: Float64, model: TrackedModel, depth: Float32, intrinsics: CameraIntrinsics
-    ) -> RegistrationResult | None:
-        self._show(model)
-        T = self._align_depth(T_camera_object, depth, intrinsics)
-        return self._registration.register(depth, intrinsics, {PROBE: T}).get(PROBE)
-
     def _align_depth(self, T_camera_object: Float64, depth: Float32, intrinsics: CameraIntrinsics) -> Float64:
         """Slide the model along the viewing ray of its centre until its rendered depth matches the measured one.
 
@@ -124,6 +141,13 @@ class Prober:
             shift = _mode(differences, width)
             T[:3, 3] *= (T[2, 3] + shift) / T[2, 3]
         return T
+
+
+def _turned(T: Float64, axis: int, angle: float) -> Float64:
+    """A pose turned about its own centre and one of its own axes, radians."""
+    turn = np.eye(4)
+    turn[:3, :3] = exp_so3(angle * np.eye(3)[axis])
+    return T @ turn
 
 
 def _mode(values: Float64, width: float) -> float:

@@ -61,6 +61,10 @@ class RegistrationConfig:
     """Solver steps on the same correspondences (the paper: 10 Umeyama fits)."""
     tolerance: float = 5e-5
     """An instance that an outer iteration moves by less than this has converged, metres of surface."""
+    max_shift: float = 0.01
+    """Longest solver step, metres: correspondences are only valid near where they were cast."""
+    max_turn: float = np.deg2rad(2.0)
+    """Largest solver step, radians."""
     edge_kernel: float = 3.0
     """Scale of the kernel on silhouette offsets, standard deviations."""
     edge_step: float = 0.02
@@ -188,12 +192,13 @@ class Registration:
 
         """
         current = self._place(intrinsics, poses, fixed)
+        strides = self._strides(intrinsics, current)
         results: dict[int, RegistrationResult] = {}
         if not current:
             return results
         for step in schedule or self.config.schedule:
             for _ in range(step.repeats):
-                batch = _Batch(self, depth, intrinsics, current, step)
+                batch = _Batch(self, depth, intrinsics, current, strides, step)
                 if self.config.solver == "umeyama":
                     batch.solve_umeyama()
                 else:
@@ -217,7 +222,7 @@ class Registration:
         current = self._place(intrinsics, poses, fixed)
         if not current:
             return {}
-        batch = _Batch(self, depth, intrinsics, current, self.config.schedule[-1])
+        batch = _Batch(self, depth, intrinsics, current, self._strides(intrinsics, current), self.config.schedule[-1])
         batch.evaluate()
         return batch.results()
 
@@ -264,6 +269,11 @@ class Registration:
         area = (window[2] - window[0]) * (window[3] - window[1])
         return 1 if area <= self.config.max_rays else 2 if area <= 4 * self.config.max_rays else 4
 
+    def _strides(self, intrinsics: CameraIntrinsics, poses: Mapping[int, Float64]) -> dict[int, int]:
+        """Pixel grid of every instance; chosen once for a registration, so that iterations do not alternate."""
+        windows = {i: self._window(i, T, intrinsics) for i, T in poses.items()}
+        return {i: self._stride(w) for i, w in windows.items() if w is not None}
+
     def _cast(
         self, intrinsics: CameraIntrinsics, windows: Sequence[tuple[tuple[int, int, int, int], int]]
     ) -> tuple[RayHits, Int32]:
@@ -285,6 +295,7 @@ class _Batch:
         depth: Float32,
         intrinsics: CameraIntrinsics,
         poses: Mapping[int, Float64],
+        strides: Mapping[int, int],
         step: Step,
     ) -> None:
         config = registration.config
@@ -293,12 +304,9 @@ class _Batch:
         self._instances = list(poses)
         self._models = [registration._models[i] for i in self._instances]
         self._camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
-        windows = [registration._window(i, T, intrinsics) for i, T in poses.items()]
-        strides = [registration._stride(w) if w is not None else 1 for w in windows]
-        self._strides = np.array(strides, np.int32)
-        hits, pixels = registration._cast(
-            intrinsics, [(w, s) for w, s in zip(windows, strides, strict=True) if w is not None]
-        )
+        windows = [(w, strides[i]) for i, T in poses.items() if (w := registration._window(i, T, intrinsics))]
+        self._strides = np.array([strides[i] for i in poses], np.int32)
+        hits, pixels = registration._cast(intrinsics, windows)
         K = len(self._instances)
         self._centres = np.array([T[:3, 3] for T in poses.values()])
         self._rotations = np.tile(np.eye(3), (K, 1, 1))
@@ -352,9 +360,8 @@ class _Batch:
             for k in range(K):
                 H, b = self._system(k, g[k], g_edge[k])
                 xi = _constrained_solution(H, b, self._models[k].radius, self._config.unconstrained_sigma)[0]
-                norm = float(np.sqrt(xi[3:] @ xi[3:]))
-                if norm > 0.3:  # a step beyond the linearisation's reach
-                    xi *= 0.3 / norm
+                xi[:3] *= min(1.0, self._config.max_shift / max(float(np.linalg.norm(xi[:3])), 1e-12))
+                xi[3:] *= min(1.0, self._config.max_turn / max(float(np.linalg.norm(xi[3:])), 1e-12))
                 self._rotations[k] = orthonormal(exp_so3(xi[3:]) @ self._rotations[k])
                 self._shifts[k] += xi[:3]
         self._accumulate(np.full(K, self._step.kernel), np.zeros((K, 6)), np.zeros((K, 6)))
@@ -408,6 +415,9 @@ class _Batch:
         faces leave open: where the faces know more than `edge_sigma`, they alone decide.
         """
         points, edges = self._correlation(k)
+        # A posteriori variance factor: how much better or worse the faces fit than the sensor model says.
+        pairs, squares = self._stats[k, :2]
+        points *= float(np.clip(squares / pairs, 1e-3, 4.0)) if pairs > 10.0 else 1.0
         H, H_edge = _symmetric(self._H[k]) / points, _symmetric(self._edge_H[k]) / edges
         if self._step.silhouettes == "always":
             return H + H_edge, (g / points + g_edge / edges)
