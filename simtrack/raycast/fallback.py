@@ -8,7 +8,7 @@ import numpy as np
 from simtrack.contracts import Float32, Float64
 
 if TYPE_CHECKING:
-    from simtrack.raycast.scene import Instance, RayHits
+    from simtrack.raycast.scene import ClosestPoints, Instance, RayHits
 
 
 def cast(
@@ -35,7 +35,7 @@ def cast(
         T_map_mesh = _pose_at(entry.keys, times)
         rays = np.flatnonzero(usable)
         T = T_map_mesh if T_map_mesh.ndim == 2 else T_map_mesh[rays]
-        T_mesh_map = np.linalg.inv(T)
+        T_mesh_map: Float64 = np.linalg.inv(T).astype(np.float64)
         local_directions = np.einsum(
             "...ij,nj->ni" if T.ndim == 2 else "nij,nj->ni", T_mesh_map[..., :3, :3], directions[rays]
         )
@@ -83,3 +83,19 @@ def _pose_at(keys: Float64, times: np.ndarray) -> Float64:
     segment = np.minimum(position.astype(int), len(keys) - 2)
     fraction = (position - segment)[:, None, None]
     return (1.0 - fraction) * keys[segment] + fraction * keys[segment + 1]
+
+
+def closest(instances: "Mapping[int, Instance]", points: Float32, max_distance: float, found: "ClosestPoints") -> None:
+    """Fill `found` by exhaustive search of each instance's triangles, moved to the map frame."""
+    from simtrack.raycast.closest import search
+
+    found.points[:], found.instances[:], found.faces[:] = points, -1, -1
+    found.distances[:] = np.where(np.isfinite(points).all(1), max_distance, -1.0)  # nothing is nearer than -1
+    output = (found.points, found.distances, found.instances, found.faces)
+    for number in sorted(instances):
+        entry = instances[number]
+        if entry.enabled:
+            T = entry.keys[0]
+            vertices = entry.mesh.vertices.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+            search(points.astype(np.float64), vertices[entry.mesh.faces], number, output)
+    found.distances[found.instances < 0] = np.inf

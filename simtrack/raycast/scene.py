@@ -308,6 +308,39 @@ class RayScene:
             kernels.occluded(lanes, self._top, kernels.Rays(*rays), np.float32(min_distance), limit, blocked)
         return blocked
 
+    def closest_points(self, points: npt.ArrayLike, max_distance: float = np.inf) -> ClosestPoints:
+        """Nearest surface points of the enabled instances; moving ones stand at their first key.
+
+        Args:
+            points: (N, 3), map frame, metres; one that is not finite finds nothing.
+            max_distance: metres; what is farther counts as nothing.
+
+        Raises:
+            InvalidValueError: wrong shape, or a negative distance.
+        """
+        queries = np.ascontiguousarray(points, np.float32)
+        if queries.ndim != 2 or queries.shape[1] != 3:
+            raise InvalidValueError("points", queries.shape, "(N, 3)")
+        if not max_distance >= 0:
+            raise InvalidValueError("max_distance", max_distance, ">= 0")
+        self.commit()
+        count = len(queries)
+        found = ClosestPoints(
+            np.empty((count, 3), np.float32),
+            np.empty(count, np.float32),
+            np.empty(count, np.int32),
+            np.empty(count, np.int32),
+        )
+        if self.fallback:
+            fallback.closest(self._instances, queries, max_distance, found)
+        elif count:
+            from simtrack.raycast import closest
+
+            output = (found.points, found.distances, found.instances, found.faces)
+            arguments = (self._top, closest.CALLBACK, queries, np.float32(max_distance), self._geometry(), output)
+            kernels.run(closest.closest, closest.closest_parallel, *arguments)
+        return found
+
     # -------------------------------------------------------------------------------------------------- life and end
 
     def close(self) -> None:
@@ -355,6 +388,17 @@ class RayScene:
             if entry.geometry:
                 _write_keys(entry)
             self._dirty = True
+
+    def _geometry(self) -> object:
+        """Addresses of the instances' buffers and their poses, for point queries."""
+        from simtrack.raycast import closest
+
+        size = max(self._instances, default=-1) + 1
+        buffers, poses = np.zeros((size, 2), np.int64), np.zeros((size, 3, 4))
+        for number, entry in self._instances.items():
+            buffers[number] = entry.mesh.vertices.ctypes.data, entry.mesh.faces.ctypes.data
+            poses[number] = entry.keys[0, :3]
+        return closest.Geometry(buffers, poses)
 
     def _instance_table(self) -> object:
         size = max(self._instances, default=-1) + 1
