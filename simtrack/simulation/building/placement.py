@@ -80,7 +80,7 @@ class FloorSpace:
         if not self.free[window][wanted].all() or (not on_way and self.reserved[window][wanted].any()):
             return False
         remaining = self.free.copy()
-        window, covered = self._window(x, y, yaw, depth, width)
+        window, covered = self._window(x, y, yaw, depth + CELL, width + CELL)
         remaining[window] &= ~covered
         ways = self._ways(remaining)
         if ways < 0 or (self.ways > 0 and ways < 0.35 * self.ways):

@@ -39,7 +39,7 @@ class Opening:
     """Metres above the floor; 0 for a door."""
     top: float
     depth: float
-    """How far it reaches into the wall, metres."""
+    """How far it reaches into the wall, metres; 0 where two spaces simply open into each other."""
     back: Color | None
     """Colour of its rear face (glass, panel), or None for a passage."""
 
@@ -203,6 +203,8 @@ def _within(breaks: Float64, low: float, high: float) -> Bool:
 def _reveals(hole: Opening, T_map_wall: Float64, floor_color: Color) -> list[Sheet]:
     """Jambs, lintel, sill or threshold, and the rear face of an opening. The wall frame is (along, up, into)."""
     w, h, d = hole.end - hole.start, hole.top - hole.bottom, hole.depth
+    if d == 0.0:
+        return []
 
     def sheet(origin: tuple[float, float], depth: float, x: Float64, y: Float64, size: Box2, color: Color) -> Sheet:
         pose = T_map_wall @ transform(np.stack([x, y, np.cross(x, y)], axis=1), (origin[0], origin[1], depth))
