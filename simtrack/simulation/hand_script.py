@@ -23,17 +23,19 @@ Motion: TypeAlias = Iterator[HandPose]
 DT = TIMESTEP_NS * 1e-9
 PEAK = 1.875
 """Peak over mean speed of a minimum-jerk motion (Flash and Hogan, 1985)."""
-REACH_SPEED, REACH_RATE = 0.9, 3.0
+REACH_SPEED, REACH_RATE = 1.4, 3.0
 """Peak speed (m/s) and turning rate (rad/s) of the empty hand."""
-GENTLE = 0.12
+GENTLE = 0.3
 """Peak speed near things, m/s."""
 HOVER = 0.14
 """Metres above a thing from which the hand comes down to it."""
 GRIP_DEPTH = 0.055
 """Metres below the top of a thing that the finger tips reach."""
-CLEAR = 0.035
+CLEAR = 0.06
 """Metres that a thing keeps from others when it is put down."""
-TRIES = 80
+TRIES = 200
+INNER = 0.76
+"""Share of a container's width that is taken for its clear inside."""
 
 
 def minimum_jerk(share: float) -> float:
@@ -75,6 +77,7 @@ class HandDirector:
         self._rest_yaw = float(np.arctan2(centre[1] - rest[1], centre[0] - rest[0]))
         self._pose = HandPose(transform(_yawed(self._rest_yaw), rest), 0.06)
         self._motion = self._play()
+        self._touch(False)
         self._apply(self._data)
 
     @property
@@ -114,7 +117,7 @@ class HandDirector:
     def _retreat(self) -> Motion:
         T = self._pose.T_map_hand.copy()
         T[2, 3] = max(T[2, 3], self._settings.rest[2] - 0.1)
-        yield from self._move(T, 0.06, 0.5)
+        yield from self._move(T, 0.06, 0.9)
         yield from self._move(transform(_yawed(self._rest_yaw), self._settings.rest), 0.06, REACH_SPEED)
 
     def _move(self, T: Float64, opening: float, speed: float, rate: float = REACH_RATE) -> Motion:
@@ -150,11 +153,19 @@ class HandDirector:
         top = max(T_grip[2, 3], T_down[2, 3]) + height
         yield from self._move(_raised(T_grip, top), width, 0.35)
         yield from self._transport(_raised(T_down, top), turn, action, width)
-        yield from self._move(T_down, width, GENTLE + 0.06)
-        yield from self._wait(0.15)
+        yield from self._put_down(T_down, width, name)
         self._release(name)
+        T_down = self._pose.T_map_hand
         yield from self._move(T_down, min(width + 0.03, hand.MAX_OPENING), GENTLE)
         yield from self._move(_raised(T_down, T_down[2, 3] + HOVER), 0.06, 0.4)
+
+    def _put_down(self, T: Float64, opening: float, name: str) -> Motion:
+        """Down until the thing touches something, then hold still for a moment."""
+        for pose in self._move(T, opening, GENTLE):
+            yield pose
+            if pose.T_map_hand[2, 3] - T[2, 3] < 0.03 and self._touches(name):
+                break
+        yield from self._wait(0.15)
 
     def _grip(self, box: Outline) -> tuple[Float64, float]:
         """Pose of the hand that grips a thing across its narrow side, the forearm towards the rest place; its opening."""
@@ -194,19 +205,19 @@ class HandDirector:
         if to.into is not None:
             T_container, container = self._object(to.into), self._world.objects[to.into]
             relative = T_container[:3, :3].T @ R
-            room = 0.85 * container.extents[:2] - np.abs(relative[:2]) @ extents
+            room = INNER * container.extents[:2] - np.abs(relative[:2]) @ extents
             if T_container[2, 2] < 0.95 or np.any(room < 0.0):
                 return None
             offset = np.append(self._rng.uniform(-room / 2, room / 2), -container.extents[2] / 2)
             floor = T_container[:3, 3] + T_container[:3, :3] @ offset
-            return transform(R, floor + [0.0, 0.0, lift + 0.008])
+            return transform(R, floor + [0.0, 0.0, lift])
         area = self._area(to)
         local = np.array([self._rng.uniform(*area.x), self._rng.uniform(*area.y), 0.0])
         reach = np.abs((area.T_map_face[:3, :3].T @ R)[:2]) @ extents / 2
         if np.any(np.abs(local[:2]) + reach > area.size / 2 - 0.02):
             return None
         face = area.T_map_face[:3, 3] + area.T_map_face[:3, :3] @ local
-        return transform(R, face + [0.0, 0.0, lift + 0.002])
+        return transform(R, face + [0.0, 0.0, lift - 0.002])
 
     def _transport(self, T: Float64, turn: float, action: Carry, opening: float) -> Motion:
         """Across to above the target: turning about the vertical and tilting on the way, upright at both ends."""
@@ -215,9 +226,11 @@ class HandDirector:
         heading = self._rng.uniform(-np.pi, np.pi)
         axis = np.array([np.cos(heading), np.sin(heading), 0.0])
         tilt = self._rng.uniform(*action.tilt)
-        rate = max(action.turn_rate, 1e-6)
-        # The tilt rises and falls as sin^2 of the path's share, whose slope is at most pi.
-        seconds = max(PEAK * way / action.speed, PEAK * abs(turn) / rate, PEAK * np.pi * tilt / REACH_RATE, 0.4)
+        share = np.linspace(0.0, 1.0, 101)
+        slope = 30.0 * share**2 * (1.0 - share) ** 2  # of the minimum-jerk path
+        tilting = np.pi * tilt * np.sin(2.0 * np.pi * np.array([minimum_jerk(x) for x in share]))
+        spin = float(np.max(slope * np.hypot(turn, tilting)))
+        seconds = max(PEAK * way / action.speed, spin / max(action.turn_rate, 0.1), 0.4)
         steps = int(np.ceil(seconds / DT))
         for k in range(1, steps + 1):
             s = minimum_jerk(k / steps)
@@ -241,7 +254,7 @@ class HandDirector:
         end = start.copy()
         end[:3, 3] += (distance + 0.02) * direction
         yield from self._approach(start, opening)
-        yield from self._move(start, opening, GENTLE + 0.08)
+        yield from self._move(start, opening, GENTLE)
         self._touch(True)
         yield from self._move(end, opening, action.speed)
         self._touch(False)
@@ -298,6 +311,12 @@ class HandDirector:
 
     def _release(self, name: str) -> None:
         self._data.eq_active[self._model.equality(f"grip/{name}").id] = 0
+
+    def _touches(self, name: str) -> bool:
+        """Whether a thing is in contact with anything."""
+        contact, body = self._data.contact, self._world.bodies[name]
+        bodies = self._model.geom_bodyid[contact.geom]
+        return bool(np.any((bodies == body).any(axis=1) & (contact.dist <= 0.0)))
 
     def _touch(self, on: bool) -> None:
         """Let the fingers make contact, for pushes only: a grip is a weld, not a squeeze."""

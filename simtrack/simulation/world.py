@@ -226,6 +226,7 @@ def _models(scene: SceneFile) -> dict[str, ObjectModel]:
 def _set_options(spec: "mujoco.MjSpec", image_size: tuple[int, int]) -> None:
     import mujoco
 
+    spec.compiler.degree = False
     spec.option.timestep = TIMESTEP_NS * 1e-9
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -324,7 +325,8 @@ def _add_hand(composer: _Composer, scene: SceneFile) -> None:
             for k, (y, length) in enumerate(hand.FINGERS):
                 body.add_geom(
                     name=f"hand/contact{k}", type=capsule, size=[0.0095, 0, 0], group=COLLISION,
-                    fromto=[0.03, y, 0.05, 0.03, y, 0.088 - 0.088 * length], contype=0, conaffinity=0,
+                    fromto=[0.03, y, 0.05, 0.03, y, 0.088 - 0.088 * length],
+                    contype=HAND_BITS[0], conaffinity=HAND_BITS[1],
                     friction=[0.6, 0.005, 0.0001],
                 )  # fmt: skip
     for carried in sorted({action.object for action in scene.hand.script if isinstance(action, Carry)}):
