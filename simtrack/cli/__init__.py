@@ -1,0 +1,1 @@
+"""The command ``simtrack``: one module a verb; each imports what it needs when it runs."""

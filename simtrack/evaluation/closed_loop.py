@@ -31,7 +31,7 @@ from simtrack.evaluation.evaluator import Evaluator, pose_scorers, true_models
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
 from simtrack.evaluation.record import RelationTimeline, RunRecord
 from simtrack.evaluation.run_config import FIXED_GAZE, RunConfig
-from simtrack.evaluation.run_folder import RunFolder
+from simtrack.evaluation.run_folder import EstimateTables, RunFolder, TruthTables
 from simtrack.evaluation.tracking import TrackingEvaluator
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.objects import ObjectModel
@@ -213,15 +213,24 @@ class ClosedLoopRun:
         set_threads(config.threads)
         with ExitStack() as exits:
             stop = exits.enter_context(StopSignal())
-            folder = exits.enter_context(RunFolder(config.out, config.scene.name, config.overwrite))
+            folder = RunFolder(config.out, config.overwrite)
             folder.write_config(config.resolved())
+            estimates = exits.enter_context(EstimateTables(folder.path))
+            classes = [thing.model for thing in config.scene.objects]
+            truths = exits.enter_context(TruthTables(folder.path, config.scene.name, classes))
             loop = exits.enter_context(closed(config, config.agent_name))
             log = exits.enter_context(open_log(config, loop)) if config.log is not None else None
             evaluator = exits.enter_context(Evaluator(loop.simulation, config.stack, config.seconds))
             for observer in self.observers:
                 observer.start(loop.simulation.static_map, loop.simulation.models, loop.simulation.robot)
                 exits.callback(observer.close)
-            self._follow(loop, evaluator, folder, log, stop)
+            for frame, belief in self._watched(loop, evaluator, folder, log, stop):
+                with self._clock("evaluation"):
+                    objects = evaluator.observe(frame, belief)
+                    if belief is not None and evaluator.advanced:
+                        estimates.add(belief)
+                        truths.add(self._images - 1, belief, evaluator.trajectory.true[-1], objects)
+                        self._remember(belief)
             if config.compare_gaze and not stop.asked:
                 self._compare(evaluator, stop)
             self._partial = stop.asked
@@ -230,17 +239,17 @@ class ClosedLoopRun:
             folder.write_graph(loop.stack.graph.to_json())
         return record
 
-    def _follow(
+    def _watched(
         self, loop: Loop, evaluator: Evaluator, folder: RunFolder, log: McapWriter | None, stop: StopSignal
-    ) -> None:
+    ) -> Iterator[tuple[SensorFrame, Belief | None]]:
+        """The frames of the loop until it ends or is stopped; shows them to observers and saves between them."""
         saved = 0
         for frame, belief in loop.drive(self.config.seconds, self._clock, log):
             if isinstance(frame, RgbdFrame):
                 self._images += 1
                 if self._steady_from is None and frame.stamp >= WARM_UP:
                     self._steady_from = self._images, self._clock.loop
-            with self._clock("evaluation"):
-                self._measure(loop, evaluator, folder, frame, belief)
+            yield frame, belief
             for observer in self.observers:
                 observer.frame(frame, belief)
             if loop.simulation.now - saved >= SAVE_PERIOD:
@@ -250,17 +259,7 @@ class ClosedLoopRun:
             if stop.asked:
                 return
 
-    def _measure(
-        self, loop: Loop, evaluator: Evaluator, folder: RunFolder, frame: SensorFrame, belief: Belief | None
-    ) -> None:
-        objects = evaluator.observe(frame, belief)
-        if belief is None or not evaluator.advanced:
-            return
-        ids = {name: number for number, name in enumerate(sorted(loop.simulation.models), start=1)}
-        localization = belief.localization
-        folder.add_pose(belief.stamp, localization.status.value, evaluator.trajectory.true[-1], localization.T_map_base)
-        folder.add_objects(objects)
-        folder.add_bop(self._images - 1, objects, ids)
+    def _remember(self, belief: Belief) -> None:
         self._timeline.observe(belief.stamp, belief.relations)
         for stage, seconds in belief.stage_seconds.items():
             self._stages[stage].append(seconds)

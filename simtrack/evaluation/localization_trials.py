@@ -147,7 +147,8 @@ class FloorPlan:
         """(2,) a random place in the largest connected free area."""
         from scipy.ndimage import label
 
-        areas, _ = label(self.free)
+        areas = np.empty(self.free.shape, np.int32)
+        label(self.free, output=areas)
         sizes = np.bincount(areas.ravel())
         sizes[0] = 0
         cells = np.argwhere(areas == sizes.argmax())
@@ -165,7 +166,7 @@ def floor_plan(world: "StaticWorld", radius: float = 0.35) -> FloorPlan:
     shape = np.ceil((mesh.vertices[:, :2].max(axis=0) + 0.5 - origin) / resolution).astype(int) + 1
     bounds, faces = np.array([0.1, 1.5]), np.asarray(mesh.faces, np.int64)
     occupied, level = rasterise(mesh.vertices, faces, origin, resolution, bounds, 0.0, int(shape[0]), int(shape[1]))
-    clearance = distance_transform_edt(~occupied[0]) * resolution
+    clearance = np.asarray(distance_transform_edt(~occupied[0])) * resolution
     return FloorPlan(level & (clearance > radius), clearance, origin, resolution)
 
 
@@ -203,8 +204,8 @@ class LidarWorld:
     joints: dict[str, float] = field(default_factory=dict)
     """Joint positions of the robot, rad or m."""
     lidar: LidarModel = VLP16
-    lidar_noise: LidarNoiseConfig = LidarNoiseConfig()
-    odometry_noise: OdometryNoiseConfig = OdometryNoiseConfig()
+    lidar_noise: LidarNoiseConfig = field(default_factory=LidarNoiseConfig)
+    odometry_noise: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
 
     def __post_init__(self) -> None:
         mesh = self.world.mesh()

@@ -1,8 +1,9 @@
 """The folder of a run: every file is on disk line by line, so that what a crash leaves is good.
 
-``config.yaml`` resolved configuration and versions; ``trajectory.csv`` true and believed poses of base and camera;
-``poses.csv`` one line an object-frame; ``<method>_<scene>-test.csv`` results in the format of the BOP challenge;
-``graph.json`` the scene graph; ``metrics.json``; ``report.html``.
+``config.yaml`` resolved configuration and versions; ``estimates.csv`` and ``tracks.csv`` what the stack believed of the
+robot and of every object; ``trajectory.csv`` true and believed pose of the base; ``poses.csv`` one line an
+object-frame; ``simtrack_<scene>-test.csv`` results in the format of the BOP challenge; ``graph.json`` the scene
+graph; ``metrics.json``; ``report.html``.
 """
 
 import csv
@@ -10,14 +11,18 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Self
 
-from simtrack.contracts import Float64
+from simtrack.contracts import Belief, Float64
 from simtrack.errors import InvalidValueError, OutputExistsError
 from simtrack.evaluation.metrics import Metric, write_atomically, write_metrics
 from simtrack.evaluation.tracking import ObjectFrame
 from simtrack.geometry.transforms import quaternion_from_rotation
 
-OWN_FILES = ("config.yaml", "trajectory.csv", "poses.csv", "graph.json", "metrics.json", "report.html")
+OWN_FILES = (
+    "config.yaml", "estimates.csv", "tracks.csv", "trajectory.csv", "poses.csv", "graph.json", "metrics.json",
+    "report.html",
+)  # fmt: skip
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 TRAJECTORY = ("stamp_ns", "status", *(f"{who}_{c}" for who in ("true", "estimated") for c in _POSE))
 POSES = (
@@ -25,16 +30,22 @@ POSES = (
     *(f"true_{c}" for c in _POSE), *(f"estimated_{c}" for c in _POSE),
     "translation_error", "rotation_error", "add", "map_translation_error", "map_rotation_error",
 )  # fmt: skip
+ESTIMATES = ("stamp_ns", "status", *_POSE)
+TRACKS = ("stamp_ns", "track", "class", "status", *_POSE, "visible_fraction", "moving", "score")
 BOP = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 
 
 class RunFolder:
-    """Writes one run; a context manager."""
+    """The folder of one run or replay, and the files in it that are written as a whole."""
 
-    def __init__(self, path: Path, scene: str, overwrite: bool = False) -> None:
-        """Raises `OutputExistsError` if the folder exists; with `overwrite`, the files of an older run are removed."""
+    def __init__(self, path: Path, overwrite: bool = False) -> None:
+        """Make the folder; with `overwrite`, the files of an older run in it are removed, and nothing else.
+
+        Raises:
+            OutputExistsError: the folder exists and may not be overwritten.
+            InvalidValueError: it cannot be written.
+        """
         self.path = Path(path)
-        self._bop_name = f"simtrack_{scene.replace('_', '')}-test.csv"
         if self.path.exists() and not self.path.is_dir():
             raise InvalidValueError("out", str(path), "a folder, but this is a file")
         if self.path.exists() and not overwrite:
@@ -43,9 +54,7 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             for old in [*map(self.path.joinpath, OWN_FILES), *self.path.glob("simtrack_*-test.csv")]:
                 old.unlink(missing_ok=True)
-            self._trajectory = _Table(self.path / "trajectory.csv", TRAJECTORY)
-            self._poses = _Table(self.path / "poses.csv", POSES)
-            self._bop = _Table(self.path / self._bop_name, BOP)
+            (self.path / OWN_FILES[0]).touch()
         except OSError as error:
             raise InvalidValueError("out", str(path), f"a folder that can be written ({error.strerror})") from error
 
@@ -55,27 +64,6 @@ class RunFolder:
 
         write_atomically(self.path / "config.yaml", yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True))
 
-    def add_pose(self, stamp: int, status: str, true: Float64, estimated: Float64) -> None:
-        """Append one true and one believed T_map_base."""
-        self._trajectory.write([(stamp, status, *_pose(true), *_pose(estimated))])
-
-    def add_objects(self, frames: Sequence[ObjectFrame]) -> None:
-        """Append the object-frames of one stamp; poses are T_camera_object, lengths metres, angles radians."""
-        self._poses.write(_object_row(frame) for frame in frames)
-
-    def add_bop(self, image: int, frames: Sequence[ObjectFrame], object_ids: Mapping[str, int]) -> None:
-        """Append the tracked objects of one image as BOP results: millimetres, matrices row-major.
-
-        The time is -1, which BOP reads as not measured: wall time would make files of equal runs differ.
-        """
-        self._bop.write(
-            (1, image, object_ids[frame.class_name], f"{frame.track.score:.6f}",
-             " ".join(f"{v:.8f}" for v in frame.track.T_camera_object[:3, :3].ravel()),
-             " ".join(f"{1000 * v:.6f}" for v in frame.track.T_camera_object[:3, 3]), -1)
-            for frame in frames
-            if frame.track is not None
-        )  # fmt: skip
-
     def write_metrics(self, metrics: Mapping[str, Metric]) -> None:
         """Replace ``metrics.json``."""
         write_metrics(self.path / "metrics.json", metrics)
@@ -84,18 +72,76 @@ class RunFolder:
         """Replace ``graph.json``."""
         write_atomically(self.path / "graph.json", text)
 
+
+class _Tables:
+    """Tables that are closed together; a context manager."""
+
+    def __init__(self) -> None:
+        self._open: list[_Table] = []
+
+    def _table(self, path: Path, header: Sequence[str]) -> "_Table":
+        self._open.append(_Table(path, header))
+        return self._open[-1]
+
     def close(self) -> None:
         """Close the tables."""
-        for table in (self._trajectory, self._poses, self._bop):
+        for table in self._open:
             table.close()
 
-    def __enter__(self) -> "RunFolder":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class EstimateTables(_Tables):
+    """What the stack believed; the same for a run and for a replay of its log."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._estimates = self._table(folder / "estimates.csv", ESTIMATES)
+        self._tracks = self._table(folder / "tracks.csv", TRACKS)
+
+    def add(self, belief: Belief) -> None:
+        """Append T_map_base and every track's T_map_object, as believed at one stamp."""
+        localization = belief.localization
+        self._estimates.write([(belief.stamp, localization.status.value, *_pose(localization.T_map_base))])
+        self._tracks.write(
+            (belief.stamp, track.id, track.class_name, track.status.value, *_pose(track.T_map_object),
+             f"{track.visible_fraction:.3f}", int(track.moving), f"{track.score:.3f}")
+            for track in belief.tracks
+        )  # fmt: skip
+
+
+class TruthTables(_Tables):
+    """What was believed next to what was true."""
+
+    def __init__(self, folder: Path, scene: str, classes: Iterable[str]) -> None:
+        """`classes`: names of the catalogue objects; BOP's object ids number them in alphabetical order from 1."""
+        super().__init__()
+        self._object_ids = {name: number for number, name in enumerate(sorted(set(classes)), start=1)}
+        self._trajectory = self._table(folder / "trajectory.csv", TRAJECTORY)
+        self._poses = self._table(folder / "poses.csv", POSES)
+        # An underscore would end the data set's name for BOP's tools.
+        self._bop = self._table(folder / f"simtrack_{scene.replace('_', '')}-test.csv", BOP)
+
+    def add(self, image: int, belief: Belief, T_map_base: Float64, objects: Sequence[ObjectFrame]) -> None:
+        """Append one camera stamp: `image` is its running number, `T_map_base` (4, 4) true."""
+        localization = belief.localization
+        poses = *_pose(T_map_base), *_pose(localization.T_map_base)
+        self._trajectory.write([(belief.stamp, localization.status.value, *poses)])
+        self._poses.write(_object_row(frame) for frame in objects)
+        self._bop.write(self._bop_row(image, frame) for frame in objects if frame.track is not None)
+
+    def _bop_row(self, image: int, frame: ObjectFrame) -> tuple[object, ...]:
+        """A result: millimetres, matrices row-major; no time (-1): wall time would make files of equal runs differ."""
+        assert frame.track is not None
+        T, score = frame.track.T_camera_object, f"{frame.track.score:.6f}"
+        R, t = (" ".join(f"{v:.8f}" for v in values) for values in (T[:3, :3].ravel(), 1000 * T[:3, 3]))
+        return 1, image, self._object_ids[frame.class_name], score, R, t, -1
 
 
 class _Table:

@@ -14,8 +14,9 @@ from simtrack.evaluation.record import Interval, RunRecord
 from simtrack.evaluation.targets import Target
 from simtrack.geometry.meshes import box_mesh
 from simtrack.geometry.transforms import transform
+from simtrack.report.headline import format_metric, table
 from simtrack.report.overlay import box_layer, silhouette
-from simtrack.report.page import choose_relations, format_metric, render, table, write_report
+from simtrack.report.page import choose_relations, render, write_report
 
 INTRINSICS = CameraIntrinsics(640, 480, 577.0, 577.0, 319.5, 239.5)
 

@@ -1,0 +1,124 @@
+"""What the command prints: messages, tables, a progress line; rich is imported when something is printed."""
+
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+
+    from simtrack.evaluation.closed_loop import Progress
+
+QUIET_PERIOD = 5.0
+"""Seconds between lines of progress where there is no terminal."""
+
+
+def out() -> "Console":
+    """Standard output."""
+    from rich.console import Console
+
+    return Console(highlight=False, soft_wrap=not _is_terminal())
+
+
+def _is_terminal() -> bool:
+    import sys
+
+    return sys.stdout.isatty()
+
+
+def show_error(message: str) -> None:
+    """Print one message in red to standard error."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console.print(Text.assemble(("error: ", "bold red"), (message, "red")))
+
+
+def show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Print a warning for a person, without file and line; in the place of `warnings.showwarning`."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console.print(Text.assemble(("warning: ", "bold yellow"), str(message)))
+
+
+def show_table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: Sequence[int] = ()) -> None:
+    """Print a table; `right` are the columns to be aligned right."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for k, column in enumerate(columns):
+        table.add_column(column, justify="right" if k in right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(cell if isinstance(cell, Text) else Text(str(cell)) for cell in row))
+    out().print(table)
+
+
+class ProgressLine:
+    """One live line in a terminal, a line of text now and then elsewhere; a context manager."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._bar: Bar | None = None
+        self._task = None
+        self._what = ""
+        self._said = -QUIET_PERIOD
+
+    def __enter__(self) -> "ProgressLine":
+        console = out()
+        if console.is_terminal:
+            from rich.progress import BarColumn, Progress, TextColumn
+
+            columns = [TextColumn("{task.description}"), TextColumn("{task.fields[state]}")]
+            if console.width >= 72:
+                columns.insert(1, BarColumn(bar_width=None))  # type: ignore[arg-type]
+            self._bar = Progress(*columns, console=console, transient=True, expand=True, refresh_per_second=8)
+            self._bar.start()
+            self._task = self._bar.add_task(self._title, total=1.0, state="building the world")
+        else:
+            print(f"{self._title}: building the world", flush=True)
+        return self
+
+    def update(self, progress: "Progress") -> None:
+        """Show how far a run is."""
+        if self._what and self._what != progress.what:
+            self._title = f"{self._title.split(' · ')[0]} · {progress.what}"
+        self._what = progress.what
+        whole = f"/{progress.duration:g}" if progress.duration else ""
+        state = (
+            f"{progress.seconds:.1f}{whole} s  {progress.frames_per_second:.1f} fps  "
+            f"{progress.tracks} objects  localization {progress.localization}"
+        )
+        if self._bar is not None and self._task is not None:
+            share = progress.seconds / progress.duration if progress.duration else 0.0
+            self._bar.update(self._task, description=self._title, completed=share, state=state)
+        elif time.monotonic() - self._said >= QUIET_PERIOD:
+            self._said = time.monotonic()
+            print(f"{self._title}: {state}", flush=True)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+
+def show_written(folder: Path, names: Sequence[str]) -> None:
+    """Tell where results are."""
+    from rich.text import Text
+
+    for name in names:
+        out().print(Text.assemble("wrote ", (str(folder / name), "bold")))

@@ -1,0 +1,55 @@
+"""Entry point: finds the verb, and turns what can go wrong into one clear message."""
+
+import sys
+import warnings
+from collections.abc import Sequence
+
+import simtrack
+from simtrack.cli import console
+from simtrack.cli.objects import objects
+from simtrack.cli.query import query
+from simtrack.cli.replay import replay
+from simtrack.cli.run import run
+from simtrack.cli.scenes import scenes
+from simtrack.cli.trials import trials
+
+VERBS = {
+    "run": run,
+    "replay": replay,
+    "scenes": scenes,
+    "objects": objects,
+    "query": query,
+    "trials": trials,
+}
+DESCRIPTION = "Closed-loop test harness for object trackers and scene graphs of robots, with exact ground truth."
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code: 0 good, 2 wrong usage or input, 130 stopped by the user."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments in (["--version"], ["-V"]):
+        print(f"simtrack {simtrack.__version__}")
+        return 0
+    import tyro
+
+    from simtrack.errors import SimtrackError
+
+    warnings.showwarning = console.show_warning
+    try:
+        code = tyro.extras.subcommand_cli_from_dict(
+            VERBS, prog="simtrack", description=DESCRIPTION, args=arguments or ["--help"]
+        )
+    except SimtrackError as error:
+        console.show_error(str(error))
+        return 2
+    except KeyboardInterrupt:
+        console.show_error("stopped")
+        return 130
+    except BrokenPipeError:  # the reader of our output went away, as `head` does
+        sys.stderr.close()
+        return 0
+    return int(code or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

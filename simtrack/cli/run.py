@@ -1,0 +1,91 @@
+"""``simtrack run``: simulate a scene in a closed loop, measure every stage, write a report."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from simtrack.evaluation.closed_loop import Observer
+    from simtrack.evaluation.record import RunRecord
+
+
+def run(
+    scene: Annotated[str, tyro.conf.Positional] = "workbench",
+    duration: float | None = None,
+    seed: int = 0,
+    out: Path | None = None,
+    agent: str | None = None,
+    detector: str = "oracle",
+    renderer: Literal["mujoco", "embree"] = "mujoco",
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    compare_gaze: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    log: Path | None = None,
+    view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
+    rrd: Path | None = None,
+    threads: int | None = None,
+) -> int:
+    """Simulate a scene in a closed loop, measure every stage, write a report.
+
+    Args:
+        scene: Name of a scene (see `simtrack scenes`), or path of its folder or YAML file.
+        duration: Simulated seconds; the scene's own (20 for most) if not given.
+        seed: Of everything random.
+        out: Folder for the results; runs/SCENE-SEED if not given.
+        agent: What decides where the robot looks and drives: explorer, fixed-gaze, route; the scene's own if not given.
+        detector: What detects objects in images.
+        renderer: mujoco needs OpenGL (EGL), embree needs none.
+        overwrite: Replace the results in an existing folder.
+        compare_gaze: Run the fixed gaze on the same seed, too: what does the agent's gaze gain?
+        log: Record the sensor feed to this MCAP file, for `simtrack replay`.
+        view: Show the run live in rerun (needs the extra viz).
+        rrd: Save the run for rerun in this file (needs the extra viz).
+        threads: Threads of the compiled kernels; all cores if not given.
+    """
+    from simtrack.cli import console
+    from simtrack.evaluation.closed_loop import ClosedLoopRun
+    from simtrack.evaluation.run_config import RunConfig
+    from simtrack.report.page import write_report
+    from simtrack.simulation.scene_file import load_scene
+
+    loaded = load_scene(scene)
+    folder = out if out is not None else Path("runs") / f"{loaded.name}-{seed}"
+    config = RunConfig(
+        scene=loaded, out=folder, duration=duration, seed=seed, agent=agent, detector=detector, renderer=renderer,
+        overwrite=overwrite, log=log, compare_gaze=compare_gaze, threads=threads,
+    )  # fmt: skip
+    observers = _observers(view, rrd)
+    with console.ProgressLine(f"{loaded.name} · seed {seed}") as line:
+        record = ClosedLoopRun(config, on_progress=line.update, observers=observers).run()
+    write_report(record, folder / "report.html")
+    _summarise(record)
+    console.show_written(folder, ["metrics.json", "report.html"])
+    if record.partial:
+        console.show_error(f"stopped after {record.end / 1e9:.1f} s: the results are partial")
+        return 130
+    return 0
+
+
+def _observers(view: bool, rrd: Path | None) -> "list[Observer]":
+    if not view and rrd is None:
+        return []
+    from simtrack.report.rerun_log import RerunLog
+
+    return [RerunLog(view=view, path=rrd)]
+
+
+def _summarise(record: "RunRecord") -> None:
+    """Print what was asked and measured."""
+    from rich.text import Text
+
+    from simtrack.cli import console
+    from simtrack.evaluation.targets import targets_of
+    from simtrack.report.headline import table
+
+    targets = targets_of(record.scene)
+    names = [name for name in (targets or record.metrics) if name in record.metrics]
+    marks = {"good": Text("✓", "green"), "bad": Text("✗", "red"), "": Text("")}
+    rows = [
+        (row.name, row.value, row.asked, marks[row.verdict], row.floor) for row in table(record.metrics, names, targets)
+    ]
+    console.show_table(("metric", "value", "asked", "", "noise floor"), rows, right=(1, 2, 4))
