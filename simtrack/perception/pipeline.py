@@ -36,7 +36,7 @@ from simtrack.contracts import (
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import is_rigid, skew
 from simtrack.objects import ObjectModel
-from simtrack.perception.believed_scene import BelievedScene
+from simtrack.perception.believed_scene import MAP, BelievedScene
 from simtrack.perception.detection.runner import DetectorRunner, RunnerConfig
 from simtrack.perception.localization import LocalizerConfig, MeshLocalizer
 from simtrack.perception.scene_graph import SceneGraph, SceneGraphConfig
@@ -100,13 +100,7 @@ class PerceptionStack:
         self.config = config or StackConfig()
         self.believed = BelievedScene(static_map, models)
         self.self_filter = SelfFilter(robot)
-        self.localizer = localizer or MeshLocalizer(
-            static_map,
-            self.config.localizer,
-            scene=self.believed.scene,
-            T_map_base=T_map_base,
-            self_filter=self._own_lidar_shots,
-        )
+        self.localizer = localizer or self._mesh_localizer(static_map, T_map_base)
         self.tracker = tracker or ObjectTracker(models, self.config.tracker)
         self.graph = SceneGraph(static_map, models, self.config.scene_graph)
         self.detections = DetectorRunner(detector, models, self.config.runner)
@@ -143,6 +137,16 @@ class PerceptionStack:
         return None
 
     # ----------------------------------------------------------------------------------------------------------- stages
+
+    def _mesh_localizer(self, static_map: StaticMap, T_map_base: Float64 | None) -> MeshLocalizer:
+        """MICP-L in the believed scene: what stands before the map is seen, not taken for the map."""
+        scene = self.believed.scene
+        localizer = MeshLocalizer(
+            static_map, self.config.localizer, scene, map_instance=MAP, lidar_mask=self._own_lidar_shots
+        )
+        if T_map_base is not None:
+            localizer.initialise(0, T_map_base)
+        return localizer
 
     def _take_scan(self, scan: LidarScan) -> None:
         with self._timed("localization"):
