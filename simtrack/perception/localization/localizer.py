@@ -90,6 +90,7 @@ class MeshLocalizer:
         self._level = 0.0
         self._poor = 0
         self._last_search: int | None = None
+        self._last_scan: int | None = None
         self._latest = Localization(0, np.eye(4), UNKNOWN, Status.LOST)
         self._observed = 6
 
@@ -140,13 +141,14 @@ class MeshLocalizer:
         measurement = deskew(scan, self._odometry, sigma, c.min_range, c.max_range, mask)
         if len(measurement) < c.registration.min_correspondences:
             return self._restated(end, Status.NO_DATA)
+        self._last_scan = end
         self._latest = self._recover(measurement) if self._recovering else self._track(measurement, scan.stamp)
         return self._latest
 
     def update_depth(self, frame: RgbdFrame) -> Localization:
         """Correct with a depth image where the lidar is silent or leaves directions open; else just `pose_at`."""
         late = bool(self._anchors) and frame.stamp <= self._anchors[-1].stamp
-        silent = not self._anchors or frame.stamp - self._anchors[-1].stamp > 0.25 * NANOSECONDS
+        silent = self._last_scan is None or frame.stamp - self._last_scan > 0.25 * NANOSECONDS
         if self._recovering or late or not (silent or self._observed < 6):
             return self.pose_at(frame.stamp)
         mask = self._depth_mask(frame) if self._depth_mask is not None else None
@@ -236,9 +238,8 @@ class MeshLocalizer:
     def _recover(self, measurement: Measurement) -> Localization:
         """Weigh the hypotheses with one scan; search for more now and then; believe one when it stands out."""
         c, stamp = self.config.recovery, measurement.stamp
-        travel, before = self._travel(stamp), self._latest.stamp
-        if self._hypotheses.items and before:
-            self._hypotheses.carry(self._odometry.relative(before, stamp), self._odometry.noise(before, stamp))
+        travel = self._travel(stamp)
+        self._hypotheses.carry(self._odometry, stamp)
         due = self._last_search is None or stamp - self._last_search >= c.search_period * NANOSECONDS
         if self._everywhere and due:
             self._last_search = stamp

@@ -10,7 +10,7 @@ from simtrack.geometry.transforms import angle_between, difference
 from simtrack.perception.localization.assessment import UNJUDGED, Assessment, Verdicts, assess, lead
 from simtrack.perception.localization.config import LocalizerConfig
 from simtrack.perception.localization.measurement import Measurement
-from simtrack.perception.localization.motion import propagate
+from simtrack.perception.localization.motion import OdometryTrack, propagate
 from simtrack.perception.localization.registration import register
 from simtrack.perception.localization.surface import MapSurface
 
@@ -68,11 +68,15 @@ class HypothesisSet:
     def __init__(self, surface: MapSurface, config: LocalizerConfig) -> None:
         self._surface, self._config = surface, config
         self.items: list[Hypothesis] = []
+        self._stamp = 0
 
-    def carry(self, motion: Float64, noise: Float64) -> None:
-        """Move all hypotheses by one odometry step (see `simtrack.perception.localization.motion.propagate`)."""
-        for h in self.items:
-            h.T_map_base, h.covariance = propagate(h.T_map_base, h.covariance, motion, noise)
+    def carry(self, odometry: OdometryTrack, stamp: int) -> None:
+        """Move all hypotheses from where they were last to `stamp` (nanoseconds) by odometry."""
+        if self.items and stamp > self._stamp:
+            motion, noise = odometry.relative(self._stamp, stamp), odometry.noise(self._stamp, stamp)
+            for h in self.items:
+                h.T_map_base, h.covariance = propagate(h.T_map_base, h.covariance, motion, noise)
+        self._stamp = stamp
 
     def add(
         self,
@@ -84,13 +88,14 @@ class HypothesisSet:
         """Refine the poses (K, 4, 4) of a search by registration and take those that are new; others are confirmed.
 
         Args:
-            poses: (K, 4, 4), T_map_base.
+            poses: (K, 4, 4), T_map_base at the measurement's stamp, to which all others have been carried.
             measurement: what was searched with.
             travel: m, the odometry's travel by now.
             start: (4, 4) pose and (6, 6) covariance that were given from outside, to prefer what agrees with them.
         """
         shots = measurement.thinned(max(1, len(measurement) // 1500) | 1)
         covariance = start_covariance(0.15, 0.05)
+        self._stamp = measurement.stamp
         fresh: list[tuple[float, Float64]] = []
         for pose in poses:
             found = register(shots, self._surface, pose, covariance, self._config.registration, strides=(1, 1, 1, 1))

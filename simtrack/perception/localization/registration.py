@@ -9,6 +9,7 @@ posterior, that is one iterated extended Kalman update.
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from simtrack.contracts import Float64
 from simtrack.geometry.transforms import difference, perturb
@@ -84,7 +85,7 @@ def register(
             info, gradient = _symmetric(observed.restrict(info)), observed.restrict(gradient)
             A = info + prior + upright
             b = gradient + prior @ difference(T, T_prior) + upright @ floor_deviation(T, surface.floor)
-            step = -np.linalg.solve(A, b)
+            step = np.asarray(-np.linalg.solve(A, b), dtype=np.float64)
             T = perturb(T, step)
             steps += 1
             residual = float(np.sqrt(stats[1] / max(stats[0], 1e-12)))
@@ -93,7 +94,7 @@ def register(
         change = difference(T, T_cast)
         moved = float(np.linalg.norm(change[:3])) + reach * float(np.linalg.norm(change[3:]))
         gate = _clip_gate(2.0 * moved + 3.0 * residual, config, ceiling=gate)
-    fused = np.linalg.inv(prior + upright + info)
+    fused = _symmetric(np.linalg.inv(prior + upright + info))
     if count >= config.min_correspondences:
         own = np.diag([config.systematic_sigma**2] * 3 + [config.systematic_angle**2] * 3)
         fused = _keep_shared_error(fused, map_info, observed, own if systematic is None else own + systematic)
@@ -198,7 +199,7 @@ def _keep_shared_error(covariance: Float64, map_info: Float64, observed: _Subspa
     if not count:
         return covariance
     limit = np.linalg.inv(basis.T @ map_info @ basis + 1e-9 * np.eye(count)) + dual.T @ own @ dual
-    root = np.linalg.cholesky(_symmetric(limit))
+    root = np.asarray(np.linalg.cholesky(_symmetric(limit)), dtype=np.float64)
     inverse_root = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(_symmetric(inverse_root @ dual.T @ covariance @ dual @ inverse_root.T))
     lift = basis @ root @ vectors
@@ -214,5 +215,5 @@ def _clip_gate(value: float, config: RegistrationConfig, ceiling: float = np.inf
     return float(min(max(value, config.min_gate), config.max_gate, ceiling))
 
 
-def _symmetric(matrix: Float64) -> Float64:
-    return 0.5 * (matrix + matrix.T)
+def _symmetric(matrix: npt.NDArray[np.floating]) -> Float64:
+    return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)

@@ -65,7 +65,9 @@ def build_search_map(static_map: StaticMap, config: SearchConfig, floor: float =
     fine = np.empty(occupied.shape, np.uint8)
     nearest = np.full(occupied.shape[1:], np.inf)
     for k, layer in enumerate(occupied):
-        distance = distance_transform_edt(~layer) * config.resolution if layer.any() else np.full(layer.shape, np.inf)
+        distance = np.asarray(distance_transform_edt(~layer)) * config.resolution
+        if not layer.any():
+            distance = np.full(layer.shape, np.inf)
         fine[k] = np.round(255.0 * np.exp(-0.5 * np.square(distance / config.sigma)))
         if k < 2:  # what stands on the floor keeps the robot away; what hangs from the ceiling does not
             nearest = np.minimum(nearest, distance)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -29,7 +30,9 @@ def tessellate(boxes: list[Box], cell: float) -> tuple[np.ndarray, np.ndarray]:
         for axis in range(3):
             u, v = (axis + 1) % 3, (axis + 2) % 3
             nu, nv = (max(1, int(np.ceil((high[k] - low[k]) / cell))) for k in (u, v))
-            gu, gv = np.meshgrid(np.linspace(low[u], high[u], nu + 1), np.linspace(low[v], high[v], nv + 1), indexing="ij")
+            gu, gv = np.meshgrid(
+                np.linspace(low[u], high[u], nu + 1), np.linspace(low[v], high[v], nv + 1), indexing="ij"
+            )
             for side, value in ((0, low[axis]), (1, high[axis])):
                 grid = np.empty((gu.size, 3))
                 grid[:, axis], grid[:, u], grid[:, v] = value, gu.ravel(), gv.ravel()
@@ -166,7 +169,7 @@ def office(rng: np.random.Generator, noise: float = 0.005) -> World:
     rooms = [room("corridor", 0, 5, 24, 7)]
     for side, (y0, y1, wall) in enumerate(((0.0, 5.0, 4.9), (7.0, 12.0, 7.0))):
         cuts = np.array([0.0, *(np.array([5.0, 11.0, 18.0]) + rng.uniform(-1.5, 1.5, 3)), 24.0])
-        for k, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
+        for k, (a, b) in enumerate(pairwise(cuts)):
             if k:
                 boxes.append(Box((a - 0.05, y0, 0), (a + 0.05, y1, 2.7)))
             door = rng.uniform(a + 0.6, b - 1.6)
@@ -175,6 +178,18 @@ def office(rng: np.random.Generator, noise: float = 0.005) -> World:
             boxes += furniture(rng, a + 0.05, y0, b - 0.05, y1, 5)
             rooms.append(room(f"office{side}{k}", a, y0, b, y1))
     return make_world(boxes, tuple(rooms), rng, noise)
+
+
+def two_rooms(rng: np.random.Generator) -> World:
+    """Two rooms that are the same to the millimetre."""
+    boxes: list[Box] = []
+    inside = furniture(rng, 0, 0, 4, 3, 5)
+    for x in (0.0, 6.0):
+        boxes += shell(x, 0, x + 4, 3)
+        for box in inside:
+            low, high = (tuple(np.add(corner, (x, 0, 0))) for corner in (box.low, box.high))
+            boxes.append(Box(low, high))
+    return make_world(boxes, (room("left", 0, 0, 4, 3), room("right", 6, 0, 10, 3)), rng)
 
 
 @dataclass
@@ -244,3 +259,13 @@ def office_world() -> World:
 @pytest.fixture(scope="session")
 def corridor_world() -> World:
     return corridor(np.random.default_rng(7))
+
+
+@pytest.fixture(scope="session")
+def two_rooms_world() -> World:
+    return two_rooms(np.random.default_rng(9))
+
+
+@pytest.fixture(scope="session")
+def make_drive() -> type[Drive]:
+    return Drive
