@@ -224,7 +224,7 @@ class GroundTruth:
     def _silhouette_rays(
         self, T_map_camera: Float64, names: list[str], poses: Float64
     ) -> tuple[np.ndarray, Float64, Float64]:
-        """Rays (camera frame, z = 1) over the projected box of each object: owners (R,), rays (R, 3), pixels a ray (K,)."""
+        """Rays (camera frame, z = 1) over each object's projected box: owners (R,), rays (R, 3), pixels a ray (K,)."""
         camera = self._intrinsics
         owners, rays, area = [], [], np.zeros(len(names))
         T_camera_map = inverse(T_map_camera)

@@ -14,13 +14,14 @@ import numpy as np
 
 from simtrack.contracts import Float64
 from simtrack.geometry.meshes import Mesh, concatenate, painted
-from simtrack.geometry.transforms import transform
 
 if TYPE_CHECKING:
     import manifold3d
 
 PARTS = ("hand/palm", "hand/fingers", "hand/thumb")
 """Names of the bodies; the palm also carries the forearm."""
+SIDES = (0.0, 1.0, -1.0)
+"""Direction along x in which opening the hand moves each part, by half the opening."""
 SKIN, SLEEVE, CUFF = (222, 168, 134), (58, 92, 150), (235, 235, 230)
 MAX_OPENING = 0.13
 """Metres between the tips of fingers and thumb."""
@@ -45,13 +46,6 @@ class HandPose:
     """(4, 4)."""
     opening: float
     """Metres between the pads."""
-
-    def parts(self) -> tuple[Float64, Float64, Float64]:
-        """T_map_part (4, 4) in the order of `PARTS`."""
-        half = self.opening / 2
-        shift = transform(translation=(half, 0.0, 0.0))
-        back = transform(translation=(-half, 0.0, 0.0))
-        return self.T_map_hand, self.T_map_hand @ shift, self.T_map_hand @ back
 
 
 def _ball(centre: Float64, radius: float, segments: int = 14) -> Float64:

@@ -1,4 +1,4 @@
-"""What the hand does: picks, carries, puts down and pushes objects as the scene's script says, with minimum-jerk motions."""
+"""What the hand does: picks, carries, puts down and pushes objects as the scene's script says."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, TypeAlias
@@ -91,9 +91,9 @@ class HandDirector:
         self._apply(data)
 
     def _apply(self, data: "mujoco.MjData") -> None:
-        for mocap, T in zip(self._mocap, self._pose.parts(), strict=True):
-            data.mocap_pos[mocap] = T[:3, 3]
-            data.mocap_quat[mocap] = quaternion_from_rotation(T[:3, :3])
+        T = self._pose.T_map_hand
+        data.mocap_quat[self._mocap] = quaternion_from_rotation(T[:3, :3])
+        data.mocap_pos[self._mocap] = T[:3, 3] + np.outer(hand.SIDES, self._pose.opening / 2 * T[:3, 0])
 
     # ------------------------------------------------------------------------------------------------------- the script
 
@@ -168,7 +168,7 @@ class HandDirector:
         yield from self._wait(0.15)
 
     def _grip(self, box: Outline) -> tuple[Float64, float]:
-        """Pose of the hand that grips a thing across its narrow side, the forearm towards the rest place; its opening."""
+        """Pose of the hand that grips a thing across its narrow side, forearm towards the rest place; its opening."""
         narrow = 0 if box.half[0] <= box.half[1] else 1
         yaw = box.yaw + narrow * np.pi / 2
         if np.cos(yaw - self._rest_yaw) < 0.0:
@@ -210,14 +210,14 @@ class HandDirector:
                 return None
             offset = np.append(self._rng.uniform(-room / 2, room / 2), -container.extents[2] / 2)
             floor = T_container[:3, 3] + T_container[:3, :3] @ offset
-            return transform(R, floor + [0.0, 0.0, lift])
+            return transform(R, floor + np.array([0.0, 0.0, lift]))
         area = self._area(to)
         local = np.array([self._rng.uniform(*area.x), self._rng.uniform(*area.y), 0.0])
         reach = np.abs((area.T_map_face[:3, :3].T @ R)[:2]) @ extents / 2
         if np.any(np.abs(local[:2]) + reach > area.size / 2 - 0.02):
             return None
         face = area.T_map_face[:3, 3] + area.T_map_face[:3, :3] @ local
-        return transform(R, face + [0.0, 0.0, lift - 0.002])
+        return transform(R, face + np.array([0.0, 0.0, lift - 0.002]))
 
     def _transport(self, T: Float64, turn: float, action: Carry, opening: float) -> Motion:
         """Across to above the target: turning about the vertical and tilting on the way, upright at both ends."""
@@ -262,7 +262,7 @@ class HandDirector:
         yield from self._move(_raised(start, start[2, 3] + HOVER), 0.06, 0.4)
 
     def _course(self, action: Push, box: Outline) -> tuple[float, float] | None:
-        """Heading and distance of a push that ends on the same support, with nothing in the way; None if there is none."""
+        """Heading and distance of a push that ends on the same support, nothing in the way; None if there is none."""
         others = self._others(action.object, None)
         for _ in range(TRIES):
             yaw = float(self._rest_yaw + self._rng.uniform(-1.9, 1.9))

@@ -215,14 +215,16 @@ def _facing(
         part = world.part(start.facing)
     except UnknownNameError as error:
         raise FileFormatError(scene.path, "robot.start.facing", str(error)) from error
+    front = part.T_map_part[:2, 0]
+    pose = (0.0, 0.0, 0.0)
     for _ in range(TRIES):
         x = part.extents[0] / 2 + rng.uniform(*start.distance)
         position = apply(part.T_map_part, np.array([[x, rng.uniform(*start.lateral), 0.0]]))[0]
-        front = part.T_map_part[:2, 0]
         yaw = float(np.arctan2(-front[1], -front[0]) + rng.uniform(*start.yaw))
-        if _blocking(world.parts, float(position[0]), float(position[1])) is None:
+        pose = (float(position[0]), float(position[1]), yaw)
+        if _blocking(world.parts, pose[0], pose[1]) is None:
             break
-    return float(position[0]), float(position[1]), yaw
+    return pose
 
 
 def _in_room(

@@ -86,9 +86,10 @@ class Simulation:
         self._renderer = make_renderer(renderer, self.world, self._rays, intrinsics, FAR)
         self._hand = HandDirector(self.world, stream(seed, "hand")) if scene.hand is not None else None
         self._lidar_body = self.world.model.body(SENSOR_BODIES["lidar"]).id
+        self._T_base_lidar = self.robot.forward({})["lidar"]
         self._shots = lidar.shots()
         self._packing = RayBundle.from_directions(self._shots.directions, self._shots.rings)
-        self._counts = dict.fromkeys(("camera", "lidar", "proprioception"), 0)
+        self._counts: dict[str, int] = dict.fromkeys(("camera", "lidar", "proprioception"), 0)
         self._now = 0
         self._steps = 0
         self._static_map: StaticMap | None = None
@@ -257,13 +258,12 @@ class Simulation:
             T[:, :, 3], directions, times, self.lidar.max_range, min_distance=0.06, packing=self._packing
         )
         incidence = np.arccos(np.minimum(np.abs(np.einsum("ij,ij->i", hits.normals, directions)), 1.0))
-        intensities = reflected_intensity(self._rays.colors(hits).mean(axis=1), incidence)
+        intensities = reflected_intensity(self._rays.albedos(hits), incidence)
         ranges = apply_lidar_noise(hits.distances, intensities, self.lidar_noise, self._rng_lidar, incidence)
         self.truth.record_scan(stamp, self._rays.ids(hits))
-        T_base_lidar = self.robot.forward({})["lidar"]
         scan = LidarScan(
             stamp, shots.directions, ranges, shots.times, shots.rings,
-            np.where(np.isfinite(ranges), intensities, 0.0).astype(np.float32), T_base_lidar, self._counts["lidar"],
+            np.where(np.isfinite(ranges), intensities, 0.0).astype(np.float32), self._T_base_lidar, self._counts["lidar"],
         )  # fmt: skip
         self._feed.send(self.calibration.apply(scan), stamp + self.lidar.period)
 

@@ -113,6 +113,11 @@ class _Composer:
             contype=0, conaffinity=0, pos=T[:3, 3], quat=quaternion_from_rotation(T[:3, :3]),
         )  # fmt: skip
 
+    def show_user_shape(self, body: "mujoco.MjsBody", name: str, mesh: Mesh, T: Float64) -> None:
+        """Show a shape of the user's MJCF; it counts as furniture named after its body."""
+        self.show(body, self.mesh(name, mesh), f"static/{name}", T)
+        self.instances.append((name.rpartition("#")[0], "static", body.name, mesh, T))
+
     def finish(self) -> "mujoco.MjModel":
         """Compile; every face samples one texel, so that colours are exact and no texture is ever filtered."""
         import mujoco
@@ -161,7 +166,7 @@ def build_world(scene: SceneFile, seed: int, fovy: float = 0.79, image_size: tup
     if scene.mjcf_path is not None:
         from simtrack.simulation.user_mjcf import attach
 
-        attach(composer, scene)
+        attach(composer.spec, scene, composer.show_user_shape)
     for name, model in models.items():
         trackable = any(thing.id == name for thing in scene.objects)
         _add_object(composer, name, model, poses[name], "catalogue" if trackable else "clutter")

@@ -46,6 +46,7 @@ class WorldRays:
         self._first = 1 if fixed else 0
         self._face_ids = np.concatenate(ids)
         self._face_colors = np.concatenate(colors)
+        self._face_albedos = self._face_colors.mean(axis=1, dtype=np.float32) / np.float32(255)
         self._face_offsets = np.array(self._offsets)
 
     def place(self, data: "mujoco.MjData") -> None:
@@ -78,6 +79,10 @@ class WorldRays:
         """(N, 3) colour of the face that each ray hit, 0 to 1; 0 for a miss."""
         colors = self._face_colors[self._faces(hits)] * np.float32(1 / 255)
         return np.where(hits.hit[:, None], colors, np.float32(0.0))
+
+    def albedos(self, hits: RayHits) -> Float32:
+        """(N,) diffuse albedo 0 to 1 of the face that each ray hit: its mean colour, for want of an infrared one."""
+        return self._face_albedos[self._faces(hits)]
 
     def _faces(self, hits: RayHits) -> np.ndarray:
         return np.where(hits.hit, self._face_offsets[hits.instances] + hits.faces, 0)
