@@ -37,6 +37,7 @@ def _pointer_from_address(typing_context: Any, address: Any) -> Any:
     return types.voidptr(types.intp), generate
 
 
+_carray: Any = nb.carray  # pyright: ignore[reportPrivateImportUsage]
 _pointer: Any = intrinsic(_pointer_from_address)
 
 
@@ -127,16 +128,16 @@ def _nearer(arguments: Any) -> Any:
     The map frame serves rigid, scaled, sheared and mirrored instances alike. `userPtr` leads to six int64: instance and
     face found, addresses of the buffers' table, of the poses, and of four float64 (squared distance, point).
     """
-    words = nb.carray(_pointer(arguments), 5, np.int64)  # query, userPtr, primitive | geometry, context, scale
-    state = nb.carray(_pointer(words[1]), 5, np.int64)
-    best = nb.carray(_pointer(state[4]), 4, np.float64)
-    query = nb.carray(_pointer(words[0]), 5, np.float32)
-    instance = np.int64(nb.carray(_pointer(words[3]), 36, np.uint32)[32])
+    words = _carray(_pointer(arguments), 5, np.int64)  # query, userPtr, primitive | geometry, context, scale
+    state = _carray(_pointer(words[1]), 5, np.int64)
+    best = _carray(_pointer(state[4]), 4, np.float64)
+    query = _carray(_pointer(words[0]), 5, np.float32)
+    instance = np.int64(_carray(_pointer(words[3]), 36, np.uint32)[32])
     face = words[2] & 0xFFFFFFFF
-    buffers = nb.carray(_pointer(state[2] + 16 * instance), 2, np.int64)
-    poses = nb.carray(_pointer(state[3]), 12 * (instance + 1), np.float64)
-    corners = nb.carray(_pointer(buffers[1] + 12 * face), 3, np.uint32)
-    vertices = nb.carray(_pointer(buffers[0]), 1 << 40, np.float32)  # the true length is not needed
+    buffers = _carray(_pointer(state[2] + 16 * instance), 2, np.int64)
+    poses = _carray(_pointer(state[3]), 12 * (instance + 1), np.float64)
+    corners = _carray(_pointer(buffers[1] + 12 * face), 3, np.uint32)
+    vertices = _carray(_pointer(buffers[0]), 1 << 40, np.float32)  # the true length is not needed
     a = _corner(vertices, np.int64(corners[0]), poses, instance)
     b = _corner(vertices, np.int64(corners[1]), poses, instance)
     c = _corner(vertices, np.int64(corners[2]), poses, instance)

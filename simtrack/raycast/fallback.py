@@ -35,13 +35,10 @@ def cast(
         T_map_mesh = _pose_at(entry.keys, times)
         rays = np.flatnonzero(usable)
         T = T_map_mesh if T_map_mesh.ndim == 2 else T_map_mesh[rays]
-        T_mesh_map: Float64 = np.linalg.inv(T).astype(np.float64)
-        local_directions = np.einsum(
-            "...ij,nj->ni" if T.ndim == 2 else "nij,nj->ni", T_mesh_map[..., :3, :3], directions[rays]
-        )
-        shifted = origins[rays] - T[..., :3, 3]
-        local_origins = np.einsum("...ij,nj->ni" if T.ndim == 2 else "nij,nj->ni", T_mesh_map[..., :3, :3], shifted)
-        _keep_nearest(entry, number, rays, local_origins, local_directions, T_mesh_map, (near, far), hits)
+        linear = np.linalg.inv(T)[..., :3, :3]
+        local_directions = _times(linear, directions[rays])
+        local_origins = _times(linear, origins[rays] - T[..., :3, 3])
+        _keep_nearest(entry, number, rays, local_origins, local_directions, linear, (near, far), hits)
 
 
 def _keep_nearest(
@@ -50,7 +47,7 @@ def _keep_nearest(
     rays: np.ndarray,
     origins: Float64,
     directions: Float64,
-    T_mesh_map: Float64,
+    linear: np.ndarray,
     limits: tuple[np.float32, np.float32],
     hits: "RayHits",
 ) -> None:
@@ -68,11 +65,14 @@ def _keep_nearest(
     hits.distances[chosen] = distances[better]
     hits.faces[chosen] = output["primID"][better]
     hits.instances[chosen] = number
-    inverse = T_mesh_map[..., :3, :3] if T_mesh_map.ndim == 2 else T_mesh_map[reach][better][:, :3, :3]
-    normals = np.einsum(
-        "ji,nj->ni" if inverse.ndim == 2 else "nji,nj->ni", inverse, output["Ng"][better].astype(np.float64)
-    )
+    transposed = np.swapaxes(linear if linear.ndim == 2 else linear[reach][better], -1, -2)
+    normals = _times(transposed, output["Ng"][better])
     hits.normals[chosen] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _times(matrix: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """(N, 3) products of one (3, 3) or N matrices (N, 3, 3) with (N, 3) vectors, in float64."""
+    return (matrix @ vectors[..., None].astype(np.float64))[..., 0]
 
 
 def _pose_at(keys: Float64, times: np.ndarray) -> Float64:
