@@ -6,10 +6,9 @@ answers what the recorded detector answered. Labels, if any, lie apart; `strip_l
 """
 
 from simtrack.recordings.reader import RecordedDetector, Recording, RecordingWarning, open_recording, strip_labels
-from simtrack.recordings.writer import LoggedDetector, McapWriter
+from simtrack.recordings.writer import McapWriter
 
 __all__ = [
-    "LoggedDetector",
     "McapWriter",
     "RecordedDetector",
     "Recording",

@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
@@ -17,8 +18,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, MessageIndex, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.records import Attachment, Channel, Chunk, Message, MessageIndex, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from simtrack.errors import FileFormatError
@@ -86,17 +86,20 @@ class Container:
                     known_useless = {i for i, channel in channels.items() if channel.topic not in wanted}
                     if position.channels <= known_useless:
                         continue
-                for record in self._chunk_records(stream, position):
-                    if isinstance(record, Schema):
-                        schemas[record.id] = record
-                    elif isinstance(record, Channel):
-                        channels[record.id] = record
-                    elif isinstance(record, Message):
-                        channel = channels.get(record.channel_id)
+                for opcode, body in self._chunk_records(stream, position):
+                    if opcode == Opcode.SCHEMA:
+                        schema = self._parse(Schema.read, body, "schema")
+                        schemas[schema.id] = schema
+                    elif opcode == Opcode.CHANNEL:
+                        channel = self._parse(Channel.read, body, "channel")
+                        channels[channel.id] = channel
+                    elif opcode == Opcode.MESSAGE:
+                        message = self._parse(partial(Message.read, length=len(body)), body, "message")
+                        channel = channels.get(message.channel_id)
                         if channel is None:
-                            raise FileFormatError(self.path, f"channel {record.channel_id}", "used but not declared")
+                            raise FileFormatError(self.path, f"channel {message.channel_id}", "used but not declared")
                         if wanted is None or channel.topic in wanted:
-                            yield LogMessage(channel, schemas.get(channel.schema_id), record)
+                            yield LogMessage(channel, schemas.get(channel.schema_id), message)
 
     def _walk(self, stream: BinaryIO) -> None:
         size = stream.seek(0, io.SEEK_END)
@@ -133,7 +136,8 @@ class Container:
             # The indexes after it may be cut off with the rest.
             self.chunks.append(ChunkPosition(*chunk, None))
 
-    def _chunk_records(self, stream: BinaryIO, position: ChunkPosition) -> list[McapRecord]:
+    def _chunk_records(self, stream: BinaryIO, position: ChunkPosition) -> Iterator[tuple[int, bytes]]:
+        """(opcode, body) of each record in a chunk."""
         where = f"chunk at byte {position.offset}"
         chunk = self._parse(Chunk.read, self._body(stream, position.offset, position.length), where)
         if chunk.uncompressed_size > MAX_BYTES:
@@ -143,8 +147,14 @@ class Container:
             chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc
         ):
             raise FileFormatError(self.path, where, "checksum or size does not match: the file is damaged")
-        chunk.compression, chunk.data = "", data
-        return self._parse(lambda _: breakup_chunk(chunk), b"", where)
+        at = 0
+        while at < len(data):
+            opcode, length = _RECORD_HEADER.unpack_from(data, at) if at + _RECORD_HEADER.size <= len(data) else (0, 0)
+            at += _RECORD_HEADER.size
+            if opcode == 0 or length > len(data) - at:
+                raise FileFormatError(self.path, where, f"damaged at byte {at} of its content")
+            yield opcode, data[at : at + length]
+            at += length
 
     def _body(self, stream: BinaryIO, offset: int, length: int) -> bytes:
         if length > MAX_BYTES:
@@ -158,7 +168,7 @@ class Container:
     def _parse(self, parse: Callable[[ReadDataStream], _Record], body: bytes, where: str) -> _Record:
         try:
             return parse(ReadDataStream(io.BytesIO(body)))
-        except (McapError, struct.error, ValueError, RuntimeError) as error:
+        except (McapError, struct.error, ValueError, OverflowError) as error:
             raise FileFormatError(self.path, where, f"damaged or not MCAP: {error or type(error).__name__}") from error
 
 

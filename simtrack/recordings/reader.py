@@ -163,7 +163,7 @@ def strip_labels(source: str | Path, target: str | Path, *, overwrite: bool = Fa
                 continue
             if name == layout.METADATA:
                 kept = {key: value for key, value in json.loads(data).items() if key != layout.LABEL_KEY}
-                data = json.dumps(kept, sort_keys=True).encode()
+                data = json.dumps(kept).encode()
             media_type = "application/json" if name.endswith(".json") else "application/zip"
             writer.add_attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
         schemas: dict[int, int] = {}

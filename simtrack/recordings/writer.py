@@ -1,7 +1,7 @@
 """Writes a sensor feed as ROS 2 messages into an MCAP file, as it arrives."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -12,12 +12,10 @@ from mcap.writer import CompressionType, Writer
 
 from simtrack.contracts import (
     DetectionResult,
-    Detector,
     Float64,
     JointState,
     LidarScan,
     Odometry,
-    RegionOfInterest,
     RgbdFrame,
     SensorFrame,
     StaticMap,
@@ -62,7 +60,7 @@ class McapWriter:
         unless `overwrite`.
         """
         self.path = Path(path)
-        metadata_bytes = json.dumps(dict(metadata or {}), sort_keys=True).encode()
+        metadata_bytes = json.dumps(dict(metadata or {})).encode()
         self._stream = create_file(path, overwrite)
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile=Profile.ROS2, library="simtrack")
@@ -131,19 +129,6 @@ class McapWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
-
-
-class LoggedDetector:
-    """A detector that passes each answer of another one to a log, from which `RecordedDetector` repeats it."""
-
-    def __init__(self, detector: Detector, log: McapWriter) -> None:
-        self._detector, self._log = detector, log
-
-    def detect(self, frame: RgbdFrame, regions: Sequence[RegionOfInterest] = ()) -> DetectionResult:
-        """Ask the detector, log what it answers, and pass it on."""
-        result = self._detector.detect(frame, regions)
-        self._log.write(result)
-        return result
 
 
 def _messages(entry: SensorFrame | DetectionResult) -> list[tuple[str, bytes]]:
