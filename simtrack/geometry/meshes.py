@@ -123,7 +123,7 @@ def convex_hull(points: Float64) -> Mesh:
 
     hull = manifold3d.Manifold.hull_points(np.ascontiguousarray(points, np.float64))
     data = hull.to_mesh64()
-    if len(data.tri_verts) == 0:
+    if hull.volume() <= 1e-12 * np.linalg.norm(np.ptp(points, axis=0)) ** 3:
         raise MeshError("convex hull", "the points lie in one plane; at least four that span a volume are needed")
     return Mesh(np.asarray(data.vert_properties)[:, :3], np.asarray(data.tri_verts, np.int32))
 
@@ -227,7 +227,7 @@ def mass_properties(
     centre = volumes @ sums / (4.0 * total)
     # second moments of a tetrahedron with one corner at the origin: V / 20 (sum_i p_i p_i^T + s s^T), s = sum_i p_i
     second = np.einsum("f,fki,fkj->ij", volumes, corners, corners) + np.einsum("f,fi,fj->ij", volumes, sums, sums)
-    second = second / 20.0 - total * np.outer(centre, centre)
+    second = 0.5 * (second + second.T) / 20.0 - total * np.outer(centre, centre)
     scale = density if density is not None else given / total
     return scale * total, centre + origin, scale * (np.trace(second) * np.eye(3) - second)
 
@@ -270,6 +270,8 @@ def subdivide_to(mesh: Mesh, faces: int) -> Mesh:
     vertices, triangles = mesh.vertices, mesh.faces
     origin = np.arange(len(triangles))
     length = 1.5 * np.sqrt(4.0 / np.sqrt(3.0) * area(mesh) / max(faces, 1))  # somewhat above the final edge length
+    if is_closed(mesh):
+        faces -= (faces - len(triangles)) % 2
     while len(triangles) < faces:
         split = _terminal_edges(vertices, triangles, length, faces - len(triangles))
         if split is None:
@@ -302,6 +304,7 @@ def _terminal_edges(vertices: Float64, triangles: Int32, length: float, budget: 
     span[index] = lengths[rows, slot]
     chosen = np.flatnonzero((votes == adjacent) & (span > length))
     chosen = chosen[np.argsort(-span[chosen], kind="stable")]
+    chosen = chosen[adjacent[chosen] <= budget]
     chosen = chosen[np.cumsum(adjacent[chosen]) <= budget]
     if len(chosen) == 0:
         return None

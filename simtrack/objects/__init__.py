@@ -1,6 +1,5 @@
 """Object models: the procedural catalogue, users' own objects, and the tracker's imperfect copies of both."""
 
-from simtrack.objects.catalogue import BUILT_IN, CLUTTER, catalogue, load_object, register_folder
 from simtrack.objects.model import (
     BOX_CORNERS,
     BOX_EDGES,
@@ -9,6 +8,7 @@ from simtrack.objects.model import (
     SymmetryAxis,
     box_keypoints,
 )
+from simtrack.objects.registry import BUILT_IN, CLUTTER, catalogue, load_object, register_folder
 from simtrack.objects.semantics import SEMANTIC_CLASSES, superclasses
 from simtrack.objects.tracker_model import EXACT, TrackerModelConfig, tracker_model
 

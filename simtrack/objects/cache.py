@@ -71,7 +71,7 @@ def _numbered(parts: tuple[Mesh, ...]) -> list[tuple[str, Mesh]]:
 
 
 def _read(path: Path) -> ObjectModel:
-    with np.load(path, allow_pickle=False) as data:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
         parts = sum(1 for key in data.files if key.startswith("collision") and key.endswith(".faces"))
 
         def mesh(label: str) -> Mesh:

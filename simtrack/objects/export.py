@@ -10,8 +10,8 @@ import numpy as np
 from simtrack.errors import InvalidValueError
 from simtrack.geometry import meshes
 from simtrack.geometry.meshes import Mesh
-from simtrack.objects.catalogue import catalogue, load_object
 from simtrack.objects.model import ObjectModel
+from simtrack.objects.registry import catalogue, load_object
 
 MILLIMETRES = 1000.0
 

@@ -29,4 +29,4 @@ DESIGNS: MappingProxyType[str, Callable[[], Design]] = MappingProxyType(
         "screwdriver": handheld.screwdriver,
     }
 )
-"""Name -> its design; the names of `simtrack.objects.catalogue.BUILT_IN`."""
+"""Name -> its design; the names of `simtrack.objects.registry.BUILT_IN`."""

@@ -290,7 +290,7 @@ def cardboard_box() -> Design:
         semantic_class="cardboard-box",
         body=union(shell, tape, *flaps, label, *bars, *address),
         collision=(
-            plate((x, y, wall + 0.002), KRAFT),
+            plate((x, y, wall + 0.002), KRAFT).at(z=-0.0006),
             *(plate((0.006, y, z), KRAFT).at(x=s * (0.5 * x - 0.003)) for s in (-1, 1)),
             *(plate((x, 0.006, z), KRAFT).at(y=s * (0.5 * y - 0.003)) for s in (-1, 1)),
             *flaps,
