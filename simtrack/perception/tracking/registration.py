@@ -13,8 +13,9 @@ import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Float32, Float64, Int32
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import exp_so3, orthonormal
+from simtrack.geometry.transforms import orthonormal
 from simtrack.perception.tracking import correspondences as kernels
+from simtrack.perception.tracking import solver
 from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
 
 
@@ -193,23 +194,19 @@ class Registration:
         """
         current = self._place(intrinsics, poses, fixed)
         strides = self._strides(intrinsics, current)
-        results: dict[int, RegistrationResult] = {}
         if not current:
-            return results
+            return {}
+        batch = None
         for step in schedule or self.config.schedule:
             for _ in range(step.repeats):
                 batch = _Batch(self, depth, intrinsics, current, strides, step)
-                if self.config.solver == "umeyama":
-                    batch.solve_umeyama()
-                else:
-                    batch.solve_gauss_newton()
-                results = batch.results()
-                for instance, result in results.items():
-                    current[instance] = result.T_camera_object
-                    self._scene.set_pose(instance, result.T_camera_object)
+                batch.solve(self.config.inner_iterations)
+                current = batch.poses()
+                for instance, T in current.items():
+                    self._scene.set_pose(instance, T)
                 if batch.largest_step() < self.config.tolerance:
                     break
-        return results
+        return batch.results() if batch is not None else {}
 
     def assess(
         self,
@@ -223,7 +220,7 @@ class Registration:
         if not current:
             return {}
         batch = _Batch(self, depth, intrinsics, current, self._strides(intrinsics, current), self.config.schedule[-1])
-        batch.evaluate()
+        batch.solve(0)
         return batch.results()
 
     def depth_differences(
@@ -312,10 +309,9 @@ class _Batch:
         self._rotations = np.tile(np.eye(3), (K, 1, 1))
         self._shifts = np.zeros((K, 3))
         self._correspond(registration, hits, pixels, depth)
-        self._H = np.zeros((K, 6, 6))
-        self._edge_H = np.zeros((K, 6, 6))
+        self._radii = np.array([m.radius for m in self._models])
+        self._covariance, self._constrained = np.zeros((K, 6, 6)), np.zeros(K, np.int64)
         self._stats = np.zeros((K, 3))
-        self._edge_stats = np.zeros((K, 2))
 
     def _correspond(self, registration: Registration, hits: RayHits, pixels: Int32, depth: Float32) -> None:
         config, K, N = self._config, len(self._instances), len(pixels)
@@ -350,135 +346,62 @@ class _Batch:
         self._edge_owner = self._edge_owner[:count]
         registration._instance_image.reshape(-1)[pixels] = kernels.UNKNOWN_PIXEL
 
-    def solve_gauss_newton(self) -> None:
-        """Move every instance by Gauss-Newton steps on the fixed correspondences."""
-        K = len(self._instances)
-        for _ in range(self._config.inner_iterations):
-            g = np.zeros((K, 6))
-            g_edge = np.zeros((K, 6))
-            self._accumulate(np.full(K, self._step.kernel), g, g_edge)
-            for k in range(K):
-                H, b = self._system(k, g[k], g_edge[k])
-                xi = _constrained_solution(H, b, self._models[k].radius, self._config.unconstrained_sigma)[0]
-                xi[:3] *= min(1.0, self._config.max_shift / max(float(np.linalg.norm(xi[:3])), 1e-12))
-                xi[3:] *= min(1.0, self._config.max_turn / max(float(np.linalg.norm(xi[3:])), 1e-12))
-                self._rotations[k] = orthonormal(exp_so3(xi[3:]) @ self._rotations[k])
-                self._shifts[k] += xi[:3]
-        self._accumulate(np.full(K, self._step.kernel), np.zeros((K, 6)), np.zeros((K, 6)))
-
-    def evaluate(self) -> None:
-        """Gather information and residuals at the present poses."""
-        K = len(self._instances)
-        self._accumulate(np.full(K, self._step.kernel), np.zeros((K, 6)), np.zeros((K, 6)))
-
-    def solve_umeyama(self) -> None:
-        """Move every instance by repeated closed-form fits (Umeyama 1991, without scale) on the fixed correspondences."""
-        K = len(self._instances)
-        for _ in range(self._config.inner_iterations):
-            count, cross = np.zeros(K), np.zeros((K, 3, 3))
-            mean_p, mean_q = np.zeros((K, 3)), np.zeros((K, 3))
-            kernels.umeyama_sums(
+    def solve(self, iterations: int) -> None:
+        """Move every instance by solver steps on the fixed correspondences (0: only judge the present poses)."""
+        config = self._config
+        if config.solver == "umeyama":
+            solver.umeyama(
                 self._measured, self._model, self._normal, self._owner, self._centres, self._rotations, self._shifts,
-                count, mean_p, mean_q, cross,
+                iterations,
             )  # fmt: skip
-            for k in range(K):
-                if count[k] < 6:
-                    continue
-                p, q = mean_p[k] / count[k], mean_q[k] / count[k]
-                U, _, Vt = np.linalg.svd(cross[k] / count[k] - np.outer(p, q))
-                R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-                self._rotations[k] = orthonormal(R @ self._rotations[k])
-                self._shifts[k] = R @ self._shifts[k] + p - R @ q
-        self.evaluate()
-
-    def _accumulate(self, scale: Float64, g: Float64, g_edge: Float64) -> None:
-        self._H[:], self._edge_H[:], self._stats[:], self._edge_stats[:] = 0.0, 0.0, 0.0, 0.0
-        kernels.point_normal_equations(
-            self._measured, self._model, self._normal, self._weight, self._owner, self._centres, self._rotations,
-            self._shifts, scale, self._H, g, self._stats,
-        )  # fmt: skip
-        kernels.edge_normal_equations(
+            iterations = 0
+        stride = self._strides.astype(float)
+        points, edges = config.correlation_area / stride**2, config.edge_correlation / stride
+        solver.gauss_newton(
+            self._measured, self._model, self._normal, self._weight, self._owner,
             self._edge_point, self._edge_direction, self._edge_offset, self._edge_weight, self._edge_owner,
-            self._camera, self._centres, self._rotations, self._shifts, self._config.edge_kernel, self._edge_H, g_edge,
-            self._edge_stats,
+            self._camera, self._centres, self._rotations, self._shifts, self._radii,
+            np.maximum(1.0, np.stack([points, edges], axis=1)), self._step.kernel, config.edge_kernel,
+            _EDGES[self._step.silhouettes], config.edge_sigma, config.unconstrained_sigma, config.max_shift,
+            config.max_turn, iterations, self._covariance, self._constrained, self._stats,
         )  # fmt: skip
 
-    def _correlation(self, k: int) -> tuple[float, float]:
-        """By how much the independent-pixel information overstates what is known: (points, silhouette)."""
-        stride = float(self._strides[k])
-        return max(1.0, self._config.correlation_area / stride**2), max(1.0, self._config.edge_correlation / stride)
-
-    def _system(self, k: int, g: Float64, g_edge: Float64) -> tuple[Float64, Float64]:
-        """Information (6, 6) and gradient (6,) of both kinds of residuals.
-
-        Silhouettes lie on the pixel grid and are blurred by the sensor, so they speak only in the directions that the
-        faces leave open: where the faces know more than `edge_sigma`, they alone decide.
-        """
-        points, edges = self._correlation(k)
-        # A posteriori variance factor: how much better or worse the faces fit than the sensor model says.
-        pairs, squares = self._stats[k, :2]
-        points *= float(np.clip(squares / pairs, 1e-3, 4.0)) if pairs > 10.0 else 1.0
-        H, H_edge = _symmetric(self._H[k]) / points, _symmetric(self._edge_H[k]) / edges
-        if self._step.silhouettes == "always":
-            return H + H_edge, (g / points + g_edge / edges)
-        radius = self._models[k].radius
-        scale = np.array([1.0, 1.0, 1.0, 1.0 / radius, 1.0 / radius, 1.0 / radius])
-        values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-        known = np.maximum(values, 0.0) * self._config.edge_sigma**2
-        voice = 1.0 / (1.0 + known**4)
-        blend = (vectors * voice) @ vectors.T
-        to_scaled, from_scaled = np.outer(scale, scale), np.outer(1.0 / scale, 1.0 / scale)
-        H_open = (blend @ (H_edge * to_scaled) @ blend) * from_scaled
-        g_open = (blend @ (g_edge / edges * scale)) / scale
-        return H + H_open, g / points + g_open
+    def poses(self) -> dict[int, Float64]:
+        """T_camera_object (4, 4) of every instance after the steps so far."""
+        out: dict[int, Float64] = {}
+        for k, instance in enumerate(self._instances):
+            T = np.eye(4)
+            T[:3, :3] = orthonormal(self._rotations[k] @ self._poses[instance][:3, :3])
+            T[:3, 3] = self._centres[k] + self._shifts[k]
+            out[instance] = T
+        return out
 
     def largest_step(self) -> float:
         """How far this iteration moved an instance at most, metres of surface."""
         moved = np.linalg.norm(self._shifts, axis=1)
         turned = np.sqrt(np.maximum(3.0 - np.trace(self._rotations, axis1=1, axis2=2), 0.0))
-        return float(np.max(moved + turned * np.array([m.radius for m in self._models])))
+        return float(np.max(moved + turned * self._radii))
 
     def results(self) -> dict[int, RegistrationResult]:
         """Results of every instance at its present pose."""
         config = self._config
         out: dict[int, RegistrationResult] = {}
-        zero = np.zeros(6)
-        for k, instance in enumerate(self._instances):
-            T = np.eye(4)
-            T[:3, :3] = orthonormal(self._rotations[k] @ self._poses[instance][:3, :3])
-            T[:3, 3] = self._centres[k] + self._shifts[k]
-            _, covariance, constrained = _constrained_solution(
-                self._system(k, zero, zero)[0], zero, self._models[k].radius, config.unconstrained_sigma
-            )
+        for k, (instance, T) in enumerate(self.poses().items()):
+            covariance = self._covariance[k].copy()
             covariance[:3, :3] += config.systematic_translation**2 * np.eye(3)
             covariance[3:, 3:] += config.systematic_rotation**2 * np.eye(3)
             supported, occluded, missing, invalid = (int(n) for n in self._counts[k, kernels.SUPPORTED :])
             inliers = max(float(self._stats[k, 0]), 1e-9)
             out[instance] = RegistrationResult(
-                T, covariance, constrained, supported + occluded + missing + invalid, supported, occluded, missing,
-                invalid, int(self._strides[k]), float(np.sqrt(self._stats[k, 2] / inliers)),
+                T, covariance, int(self._constrained[k]), supported + occluded + missing + invalid, supported,
+                occluded, missing, invalid, int(self._strides[k]), float(np.sqrt(self._stats[k, 2] / inliers)),
                 int(np.count_nonzero(self._edge_owner == k)),
             )  # fmt: skip
         return out
 
 
-def _symmetric(upper: Float64) -> Float64:
-    return upper + np.triu(upper, 1).T
-
-
-def _constrained_solution(
-    H: Float64, b: Float64, radius: float, unconstrained_sigma: float
-) -> tuple[Float64, Float64, int]:
-    """Solve ``H xi = b`` in the directions that the information matrix constrains.
-
-    Rotations are scaled by `radius` so that all directions are in metres of surface. Returns the step (6,), the
-    covariance (6, 6), which is (1 m)^2 in unconstrained directions, and the number of constrained ones.
-    """
-    scale = np.array([1.0, 1.0, 1.0, 1.0 / radius, 1.0 / radius, 1.0 / radius])
-    values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-    known = values > 1.0 / unconstrained_sigma**2
-    inverse = np.where(known, 1.0 / np.maximum(values, 1e-12), 0.0)
-    xi = scale * (vectors @ (inverse * (vectors.T @ (scale * b))))
-    variance = np.where(known, inverse, 1.0)
-    covariance = np.outer(scale, scale) * ((vectors * variance) @ vectors.T)
-    return xi, covariance, int(np.count_nonzero(known))
+_EDGES = {
+    "never": solver.EDGES_NEVER,
+    "where-open": solver.EDGES_WHERE_OPEN,
+    "always": solver.EDGES_ALWAYS,
+}
