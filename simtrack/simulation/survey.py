@@ -30,6 +30,8 @@ SCANNER_HEIGHT = 1.0
 SMALLEST_PIECE = 0.022
 """Metres: separate pieces whose second largest side is smaller (handles, rails) were not resolved."""
 
+DOORWAY = 0.9
+"""Metres around doors that nothing was put into."""
 DENSE, KEPT = 600, 0.7
 """Solids with more triangles than `DENSE` are decimated to the share `KEPT`; coarser ones have none to spare."""
 
@@ -159,6 +161,8 @@ class _FloorSpace:
         self.rooms = {room.name: shapely.Polygon(room.polygon) for room in world.rooms}
         standing = [part for part in world.parts if part.semantic_class not in ("wall", "floor", "ceiling")]
         self.names = [part.name for part in standing]
+        frames = [part for part in world.parts if part.semantic_class == "door-frame"]
+        self.doorways = shapely.union_all([shapely.Polygon(part.footprint()).buffer(DOORWAY) for part in frames])
         self.tree = shapely.STRtree([shapely.Polygon(part.footprint()) for part in standing])
 
     def _free(self, part: StaticPart) -> bool:
@@ -166,6 +170,8 @@ class _FloorSpace:
 
         footprint = shapely.Polygon(part.footprint())
         if part.room in self.rooms and not self.rooms[part.room].contains(footprint):
+            return False
+        if self.doorways.intersects(footprint):
             return False
         return all(self.names[k] == part.name for k in self.tree.query(footprint, predicate="intersects"))
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from simtrack.contracts import Bool, Float64, Room, StaticMap
+from simtrack.contracts import Bool, Float64, Int32, Room, StaticMap
 from simtrack.errors import InvalidValueError
 
 
@@ -194,7 +194,8 @@ class FloorPlan:
         return float(np.inf) if (costs < 0).any() else float(costs @ steps)
 
     def _update(self) -> None:
-        from scipy.ndimage import distance_transform_edt, label
+        import cv2
+        from scipy.ndimage import distance_transform_edt
 
         open_cells = self.known & ~self.occupied & ~self.extra
         self.clearance: Float64 = np.asarray(distance_transform_edt(open_cells)) * self.config.cell
@@ -202,7 +203,8 @@ class FloorPlan:
         needed = self.config.radius + self.config.margin
         self.drivable: Bool = self.clearance > needed
         """(rows, columns), cells that planned ways may lead through."""
-        self.regions, _ = label(self.drivable, np.ones((3, 3)))
+        regions = cv2.connectedComponents(self.drivable.astype(np.uint8), connectivity=8)[1]
+        self.regions: Int32 = np.asarray(regions, dtype=np.int32)
         """(rows, columns), number of the connected piece of drivable floor, 0 = none."""
         closeness = np.clip(1.0 - (self.clearance - needed) / max(self.config.comfort, 1e-9), 0.0, 1.0)
         self.cost: Float64 = np.where(self.drivable, 1.0 + 6.0 * closeness**2, -1.0)
