@@ -41,7 +41,7 @@ def catalogue() -> Mapping[str, Callable[[], ObjectModel]]:
 
 
 def load_object(name: str) -> ObjectModel:
-    """The model called `name`, kept in memory and on disk.
+    """The model called `name`; built once a version and kept on disk, procedural ones in memory too.
 
     Raises:
         UnknownNameError: no such object; lists the known ones.
