@@ -29,7 +29,7 @@ from simtrack.contracts import (
 from simtrack.errors import InvalidValueError
 from simtrack.evaluation.evaluator import Evaluator, pose_scorers, true_models
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
-from simtrack.evaluation.record import RelationTimeline, RunRecord
+from simtrack.evaluation.record import RelationTimeline, RunRecord, graph_name
 from simtrack.evaluation.run_config import FIXED_GAZE, RunConfig
 from simtrack.evaluation.run_folder import EstimateTables, RunFolder, TruthTables
 from simtrack.evaluation.tracking import TrackingEvaluator
@@ -260,7 +260,8 @@ class ClosedLoopRun:
                 return
 
     def _remember(self, belief: Belief) -> None:
-        self._timeline.observe(belief.stamp, belief.relations)
+        tracked = {graph_name(track) for track in belief.tracks}
+        self._timeline.observe(belief.stamp, frozenset(r for r in belief.relations if r.subject in tracked))
         for stage, seconds in belief.stage_seconds.items():
             self._stages[stage].append(seconds)
         self.on_progress(self._progress(self.config.agent_name, belief))

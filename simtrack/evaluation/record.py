@@ -19,7 +19,7 @@ from simtrack.contracts import (
     Track,
 )
 from simtrack.evaluation.metrics import Metrics
-from simtrack.evaluation.tracking import ObjectFrame
+from simtrack.evaluation.tracking import VISIBLE, ObjectFrame
 from simtrack.geometry.meshes import Mesh
 
 KEY_FRAMES, WORST_MOMENTS = 6, 4
@@ -183,8 +183,9 @@ class Album:
         result = belief.camera
         if result is None or not result.valid or result.unknown.shape != frame.depth.shape:
             return
-        # The frame with the most unknown clusters tells most; colour decides between equals.
-        score = len(result.regions) + (0.5 if frame.rgb is not None else 0.0)
+        # A frame tells most in which much is known and some clusters are left; colour decides between equals.
+        tracked = sum(track.believed and track.visible_fraction > VISIBLE for track in belief.tracks)
+        score = 10 * tracked + len(result.regions) + (0.5 if frame.rgb is not None else 0.0)
         if score > self._camera_score:
             jpeg = None if frame.rgb is None else encode_jpeg(frame.rgb)
             self.camera = CameraPicture(frame.stamp, frame.depth.copy(), result.unknown.copy(), jpeg)

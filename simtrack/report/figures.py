@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDE, NARROW = 11.0, 4.2
-"""Inches."""
+WIDE, HALF, NARROW = 11.0, 5.5, 4.2
+"""Inches: the page's whole width, half of it, and a telephone's."""
 MAX_SAMPLES = 400
 """Points of a curve in the page."""
 _STYLE: dict[Any, Any] = {
@@ -34,9 +34,11 @@ _STYLE: dict[Any, Any] = {
 }  # fmt: skip
 
 
-def both_widths(draw: "Callable[[Figure, float], None]", heights: tuple[float, float], description: str) -> str:
+def both_widths(
+    draw: "Callable[[Figure, float], None]", heights: tuple[float, float], description: str, wide_width: float = WIDE
+) -> str:
     """HTML of a figure in two widths; `draw` fills a figure of the width (inches) that it is told."""
-    wide, narrow = (_svg(draw, width, h) for width, h in zip((WIDE, NARROW), heights, strict=True))
+    wide, narrow = (_svg(draw, width, h) for width, h in zip((wide_width, NARROW), heights, strict=True))
     return (
         f'<div class="figure wide" role="img" aria-label="{description}">{wide}</div>'
         f'<div class="figure narrow" role="img" aria-label="{description}">{narrow}</div>'
@@ -71,6 +73,7 @@ def floor_plan(record: RunRecord, colors: Mapping[str, str]) -> str:
     path = np.array([T[:2, 3] for T in record.true]) if len(record.true) else np.zeros((0, 2))
     believed = np.array([T[:2, 3] for T in record.estimated]) if len(record.estimated) else np.zeros((0, 2))
     last = _last_frames(record.object_frames)
+    low, high = _extent([*path, *believed, *(T[:2, 3] for T in (f.track.T_map_object for f in last if f.track))])
 
     def draw(figure: "Figure", width: float) -> None:
         axes = figure.subplots()
@@ -87,14 +90,16 @@ def floor_plan(record: RunRecord, colors: Mapping[str, str]) -> str:
             if thing.track is not None:
                 x, y = thing.track.T_map_object[:2, 3]
                 axes.plot(x, y, marker="o", markersize=4.5, color=colors[thing.class_name], markeredgecolor=FACE)
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("x in m")
         axes.set_ylabel("y in m")
         axes.grid(True)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, 1.09 if width == WIDE else 1.14), ncols=2)
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
-    shape = _aspect(record)
-    return both_widths(draw, (min(7.0, max(4.5, WIDE * shape)), min(5.0, max(3.2, NARROW * shape))), "floor plan")
+    shape = float((high[1] - low[1]) / (high[0] - low[0]))
+    return both_widths(draw, (min(6.0, max(4.0, WIDE * shape)), min(5.0, max(3.2, NARROW * shape))), "floor plan")
 
 
 def _footprint(axes: "Axes", entity: MapEntity, names: bool) -> None:
@@ -108,16 +113,24 @@ def _footprint(axes: "Axes", entity: MapEntity, names: bool) -> None:
         *outline.T, facecolor=MUTED if wall else GRID, edgecolor=MUTED, linewidth=0.5, alpha=0.9 if wall else 0.55
     )
     if names and not wall and min(entity.extents[:2]) > 0.3 and "/" not in entity.name:
-        axes.annotate(entity.name, tuple(entity.T_map_entity[:2, 3]), ha="center", va="center", fontsize=7, color=MUTED)
+        axes.annotate(
+            entity.name,
+            tuple(entity.T_map_entity[:2, 3]),
+            ha="center",
+            va="center",
+            fontsize=7,
+            color=MUTED,
+            clip_on=True,
+            annotation_clip=True,
+        )
 
 
-def _aspect(record: RunRecord) -> float:
-    entities = [e for e in record.static_map.entities if e.semantic_class not in ("floor", "ceiling")]
-    centres = [e.T_map_entity[:2, 3] for e in entities] + [T[:2, 3] for T in record.true]
-    if len(centres) < 2:
-        return 0.6
-    size = np.ptp(np.array(centres), axis=0)
-    return float(np.clip((size[1] + 1) / (size[0] + 1), 0.3, 1.2))
+def _extent(points: Sequence[Float64], margin: float = 1.6, least: float = 5.0) -> tuple[Float64, Float64]:
+    """Lower and upper corner of the part of the plan around what happened, at least `least` metres wide and high."""
+    around = np.array(points).reshape(-1, 2) if len(points) else np.zeros((1, 2))
+    low, high = around.min(axis=0) - margin, around.max(axis=0) + margin
+    missing = np.maximum(least - (high - low), 0.0) / 2
+    return low - missing, high + missing
 
 
 def pose_error(record: RunRecord, translation: Float64, rotation: Float64) -> str:
@@ -204,7 +217,7 @@ def lidar_view(record: RunRecord, picture: LidarPicture) -> str:
         axes.set_xlabel("x in m")
         axes.set_ylabel("y in m")
 
-    return both_widths(draw, (6.2, 4.0), "lidar scan from above")
+    return both_widths(draw, (4.6, 3.8), "lidar scan from above", HALF)
 
 
 def relations(record: RunRecord, chosen: Sequence[Interval]) -> str:

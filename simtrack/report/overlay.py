@@ -12,6 +12,7 @@ import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Float64, Track, TrackStatus
 from simtrack.evaluation.record import KeyFrame, graph_name
+from simtrack.evaluation.tracking import ObjectFrame
 from simtrack.geometry.meshes import Mesh
 from simtrack.geometry.transforms import apply
 from simtrack.report.colors import LEFT_OF, ON, REFERENCE
@@ -23,11 +24,20 @@ _EDGES = ((0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4)
 _CORNERS = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 
 
-def svg_image(data: bytes, mime: str, width: int, height: int, layers: Iterable[str] = (), title: str = "") -> str:
-    """An image with layers of SVG in its pixel coordinates."""
+def svg_image(
+    data: bytes,
+    mime: str,
+    width: int,
+    height: int,
+    layers: Iterable[str] = (),
+    title: str = "",
+    window: tuple[float, float, float, float] | None = None,
+) -> str:
+    """An image with layers of SVG in its pixel coordinates; `window` (u, v, width, height) shows a part of it."""
     source = f"data:{mime};base64,{b64encode(data).decode()}"
+    u, v, w, h = window or (-0.5, -0.5, width, height)
     return (
-        f'<svg class="photo" viewBox="-0.5 -0.5 {width} {height}" role="img" aria-label="{escape(title)}">'
+        f'<svg class="photo" viewBox="{u:g} {v:g} {w:g} {h:g}" role="img" aria-label="{escape(title)}">'
         f'<image href="{source}" x="-0.5" y="-0.5" width="{width}" height="{height}"/>{"".join(layers)}</svg>'
     )
 
@@ -86,6 +96,31 @@ def track_layer(
         if labels:
             layers.append(_label(graph_name(track), np.concatenate(outlines), color, frame.intrinsics, placed))
     return layers
+
+
+def close_up(
+    frame: KeyFrame, thing: ObjectFrame, mesh: Mesh, color: str, margin: float = 0.7
+) -> tuple[list[str], tuple[float, float, float, float]]:
+    """Outlines of one object, the estimated one and, white and dashed, the true one; and a window around them."""
+    assert thing.track is not None
+    estimated = silhouette(mesh, thing.track.T_camera_object, frame.intrinsics)
+    true = silhouette(mesh, thing.T_camera_object, frame.intrinsics)
+    points = np.concatenate([*estimated, *true]) if estimated or true else np.zeros((1, 2))
+    low, high = points.min(axis=0), points.max(axis=0)
+    height = max(
+        float((high[1] - low[1]) * (1 + 2 * margin)), float((high[0] - low[0]) * (1 + 2 * margin)) * 0.75, 60.0
+    )
+    height = min(height, frame.intrinsics.height)
+    size = np.array([height / 0.75, height])
+    limit = np.array([frame.intrinsics.width, frame.intrinsics.height]) - 0.5
+    corner = np.maximum(np.minimum((low + high) / 2 - size / 2, limit - size), -0.5)
+    line = f'stroke-width="{height / 170:.2f}" fill="none" stroke-linejoin="round"'
+    dash = f'stroke-dasharray="{height / 45:.2f} {height / 60:.2f}"'
+    layers = [
+        f'<path d="{path_data(estimated)}" stroke="{color}" {line}/>',
+        f'<path d="{path_data(true)}" stroke="#fff" {line} {dash}/>',
+    ]
+    return layers, (float(corner[0]), float(corner[1]), float(size[0]), float(size[1]))
 
 
 def _label(

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from simtrack.evaluation.trajectory import absolute_errors
 from simtrack.report import figures
 from simtrack.report.colors import class_colors
 from simtrack.report.headline import format_metric, table
-from simtrack.report.overlay import query_layers, svg_image, track_layer
+from simtrack.report.overlay import close_up, query_layers, svg_image, track_layer
 
 CARDS = (
     ("localization.ate_rmse", "robot position, RMS"),
@@ -51,6 +52,10 @@ _CHANGING_FIRST = (
 )
 
 
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+
 @dataclass(frozen=True, slots=True)
 class Picture:
     """An image with its caption."""
@@ -72,6 +77,7 @@ def render(record: RunRecord) -> str:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    environment.filters["breakable"] = _breakable
     template = environment.from_string(Path(__file__).with_name("template.html").read_text(encoding="utf-8"))
     colors = class_colors([f.class_name for f in record.object_frames] + list(record.meshes))
     targets = targets_of(record.scene)
@@ -161,9 +167,10 @@ def _worst(record: RunRecord, frame: KeyFrame, colors: Mapping[str, str]) -> Pic
         f"{thing.name} (track {graph_name(thing.track)}, {state}, {100 * thing.visible_fraction:.0f} % visible): "
         f"off by {1e3 * thing.translation_error:.1f} mm and {np.degrees(thing.rotation_error):.1f}°"
     )
-    return Picture(
-        _photo(frame, track_layer(frame, record.meshes, colors), caption), _time(record, frame.stamp), caption
-    )
+    layers, window = close_up(frame, thing, record.meshes[thing.class_name], colors[thing.class_name])
+    K = frame.intrinsics
+    svg = svg_image(frame.jpeg, "image/jpeg", K.width, K.height, layers, caption, window)
+    return Picture(svg, _time(record, frame.stamp), caption)
 
 
 def _unknown(record: RunRecord, picture: CameraPicture) -> Picture:
@@ -183,6 +190,13 @@ def _unknown(record: RunRecord, picture: CameraPicture) -> Picture:
     caption = f"{share:.1f} % of {valid} measurements remain"
     data = encode_jpeg(image.clip(0, 255).astype(np.uint8))
     return Picture(svg_image(data, "image/jpeg", width, height, title=caption), _time(record, picture.stamp), caption)
+
+
+def _breakable(name: str) -> "Markup":
+    """A metric's name that may be broken after dots and underscores."""
+    from markupsafe import Markup, escape
+
+    return Markup(escape(name).replace(".", Markup(".<wbr>")).replace("_", Markup("_<wbr>")))
 
 
 def _config_text(config: Mapping[str, object]) -> str:

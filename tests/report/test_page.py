@@ -24,7 +24,7 @@ INTRINSICS = CameraIntrinsics(640, 480, 577.0, 577.0, 319.5, 239.5)
 class Balance(HTMLParser):
     """Checks that tags are closed in order."""
 
-    VOID = ("meta", "link", "br", "img", "input", "hr", "use", "path", "image")
+    VOID = ("meta", "wbr", "link", "br", "img", "input", "hr", "use", "path", "image")
 
     def __init__(self) -> None:
         super().__init__()

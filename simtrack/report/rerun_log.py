@@ -1,0 +1,146 @@
+"""Shows a run in rerun, live or as a file: images, what is unknown, tracked models, lidar, path, map.
+
+Needs the extra ``viz``. Entities are named as simtrack's frames: everything below ``map`` is in the map frame.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from simtrack.contracts import NANOSECONDS, Belief, Float64, LidarScan, RgbdFrame, SensorFrame, StaticMap, Track
+from simtrack.errors import InvalidValueError, SimtrackError
+from simtrack.geometry.kinematics import KinematicTree
+from simtrack.geometry.transforms import apply
+from simtrack.report.colors import class_colors
+
+if TYPE_CHECKING:
+    from rerun import Mesh3D, RecordingStream
+
+    from simtrack.objects import ObjectModel
+
+MAP_COLOR, ROBOT_COLOR = (150, 158, 168), (70, 130, 200)
+DEPTH_STRIDE = 2
+"""Pixels between logged depth readings: a quarter of the data."""
+
+
+class RerunLog:
+    """Watches a run (see `simtrack.evaluation.closed_loop.Observer`)."""
+
+    def __init__(self, view: bool = False, path: Path | None = None) -> None:
+        """`view`: start the viewer; `path`: save to this file.
+
+        Raises:
+            SimtrackError: rerun is not installed.
+            InvalidValueError: the file cannot be written.
+        """
+        try:
+            import rerun
+        except ImportError as error:
+            raise SimtrackError(
+                "--view and --rrd need rerun, which is not installed; install the extra: pip install 'simtrack[viz]'"
+            ) from error
+        self._rr = rerun
+        self._stream: RecordingStream = rerun.RecordingStream("simtrack")
+        if path is not None:
+            if not path.parent.is_dir():
+                raise InvalidValueError("rrd", str(path), "a file in a folder that exists")
+            self._stream.save(path)
+        elif view:
+            self._stream.spawn()
+        if view and path is not None:
+            raise InvalidValueError("view and rrd", str(path), "one of them at a time")
+        self._path: list[Float64] = []
+        self._known: set[str] = set()
+        self._scan: LidarScan | None = None
+        self._models: Mapping[str, ObjectModel] = {}
+        self._colors: Mapping[str, str] = {}
+
+    def start(self, static_map: StaticMap, models: "Mapping[str, ObjectModel]", robot: KinematicTree) -> None:
+        """Log what does not change: map and robot."""
+        rr, log = self._rr, self._stream.log
+        self._models, self._colors = models, class_colors(models)
+        log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        log(
+            "map/static",
+            rr.Mesh3D(
+                vertex_positions=static_map.vertices, triangle_indices=static_map.faces, albedo_factor=[*MAP_COLOR, 110]
+            ),
+            static=True,
+        )
+        for name, T in robot.forward({}).items():
+            link = next(link for link in robot.links if link.name == name)
+            if len(link.faces):
+                log(f"map/base/{name}", self._mesh(apply(T, link.vertices), link.faces, ROBOT_COLOR), static=True)
+
+    def frame(self, frame: SensorFrame, belief: Belief | None) -> None:
+        """Log one frame and the belief after it."""
+        if isinstance(frame, LidarScan):
+            self._scan = frame
+        if belief is None or not isinstance(frame, RgbdFrame):
+            return
+        rr, stream = self._rr, self._stream
+        stream.set_time("simulated", duration=belief.stamp / NANOSECONDS)
+        self._log_camera(frame, belief)
+        self._pose("map/base", belief.localization.T_map_base)
+        self._path.append(belief.localization.T_map_base[:3, 3])
+        stream.log("map/path", rr.LineStrips3D([np.array(self._path)], colors=[[80, 160, 255]], radii=0.01))
+        self._log_tracks(belief.tracks)
+        self._log_scan(belief)
+        for stage, seconds in belief.stage_seconds.items():
+            stream.log(f"time/{stage}", rr.Scalars(1e3 * seconds))
+
+    def _log_camera(self, frame: RgbdFrame, belief: Belief) -> None:
+        rr, log, K = self._rr, self._stream.log, frame.intrinsics
+        self._pose("map/camera", belief.T_map_camera)
+        pinhole = rr.Pinhole(
+            image_from_camera=K.matrix, width=K.width, height=K.height, camera_xyz=rr.ViewCoordinates.RDF
+        )
+        log("map/camera/image", pinhole)
+        if frame.rgb is not None:
+            log("map/camera/image/rgb", rr.Image(frame.rgb).compress(jpeg_quality=85))
+        millimetres = np.nan_to_num(1000.0 * frame.depth).clip(0, 65535).astype(np.uint16)
+        coarse = millimetres[::DEPTH_STRIDE, ::DEPTH_STRIDE]
+        log("depth", rr.DepthImage(coarse, meter=1000.0))
+        if belief.camera is not None:
+            log("map/camera/image/unknown", rr.SegmentationImage(belief.camera.unknown.astype(np.uint8)))
+
+    def _log_tracks(self, tracks: tuple[Track, ...]) -> None:
+        rr, log = self._rr, self._stream.log
+        shown: set[str] = set()
+        for track in tracks:
+            if not track.believed or track.class_name not in self._models:
+                continue
+            entity = f"map/tracks/{track.class_name}-{track.id}"
+            shown.add(entity)
+            if entity not in self._known:
+                visual = self._models[track.class_name].visual
+                color = tuple(int(self._colors[track.class_name][k : k + 2], 16) for k in (1, 3, 5))
+                log(entity, self._mesh(visual.vertices, visual.faces, color))
+            self._pose(entity, track.T_map_object)
+        for entity in self._known - shown:
+            log(entity, rr.Clear(recursive=True))
+        self._known = shown
+
+    def _log_scan(self, belief: Belief) -> None:
+        scan, result = self._scan, belief.lidar
+        if scan is None or result is None or scan.stamp != result.stamp:
+            return
+        valid = np.isfinite(scan.ranges) & (scan.ranges > 0)
+        points = scan.directions[valid].astype(float) * scan.ranges[valid, None]
+        colors = np.where(result.unknown[valid, None], (255, 59, 48), (138, 148, 160)).astype(np.uint8)
+        in_map = apply(belief.localization.T_map_base @ scan.T_base_lidar, points)
+        self._stream.log("map/lidar", self._rr.Points3D(in_map, colors=colors, radii=0.012))
+        self._scan = None
+
+    def _pose(self, entity: str, T: Float64) -> None:
+        self._stream.log(entity, self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+
+    def _mesh(self, vertices: np.ndarray, faces: np.ndarray, color: tuple[int, ...]) -> "Mesh3D":
+        return self._rr.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=[*color, 255])
+
+    def close(self) -> None:
+        """Write out what is still on its way."""
+        self._stream.flush()
+        self._stream.disconnect()
