@@ -129,7 +129,7 @@ def _pnp(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> Floa
         return None
     if not ok or not np.isfinite(rotation).all() or not np.isfinite(translation).all():
         return None
-    return _refine(transform(exp_so3(rotation.ravel()), translation.ravel()), points, pixels, intrinsics)
+    return _refine(_transform(rotation, translation), points, pixels, intrinsics)
 
 
 def _refine(T: Float64, points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> Float64:
@@ -139,7 +139,11 @@ def _refine(T: Float64, points: Float64, pixels: Float64, intrinsics: CameraIntr
         )
     except cv2.error:
         return T
-    return transform(exp_so3(rotation.ravel()), translation.ravel())
+    return _transform(rotation, translation)
+
+
+def _transform(rotation: np.ndarray, translation: np.ndarray) -> Float64:
+    return transform(exp_so3(rotation.astype(np.float64).ravel()), translation.astype(np.float64).ravel())
 
 
 def _rms(T: Float64, points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> float:
@@ -156,4 +160,4 @@ def _covariance(T: Float64, points: Float64, sigma: Float64, intrinsics: CameraI
         projection = np.array([[intrinsics.fx, 0, -intrinsics.fx * x / z], [0, intrinsics.fy, -intrinsics.fy * y / z]])
         J = projection / z @ np.hstack([np.eye(3), -skew(offset)])
         information += J.T @ J / s**2
-    return np.linalg.inv(information + 1e-3 * np.eye(6))
+    return np.asarray(np.linalg.inv(information + 1e-3 * np.eye(6)), dtype=np.float64)

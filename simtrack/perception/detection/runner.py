@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from simtrack.contracts import (
     NANOSECONDS,
@@ -27,7 +27,7 @@ class RunnerConfig:
     """An answer that is later than this, in seconds of the frames' time, is not waited for."""
     timeout: float = 30.0
     """A call that has not returned after this, in seconds of the wall clock, is given up: the detector hangs."""
-    pnp: PnpConfig = PnpConfig()
+    pnp: PnpConfig = field(default_factory=PnpConfig)
 
     def __post_init__(self) -> None:
         if self.patience <= 0.0 or self.timeout <= 0.0:

@@ -17,7 +17,7 @@ def nearest_equivalent(T: Float64, T_reference: Float64, model: ObjectModel) -> 
         return T
     rotations = T[:3, :3] @ poses[:, :3, :3]
     cosines = np.einsum("nij,ij->n", rotations, T_reference[:3, :3])
-    return T @ poses[int(np.argmax(cosines))]
+    return np.asarray(T @ poses[int(np.argmax(cosines))], dtype=np.float64)
 
 
 def rotation_apart(T: Float64, T_reference: Float64, model: ObjectModel) -> float:

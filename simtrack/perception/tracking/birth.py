@@ -31,8 +31,10 @@ class FitConfig:
     """Largest RMS residual along the normal, metres, at 1 m distance; grows with its square."""
     constrained: int = 4
     """Fewest directions that the data must constrain."""
-    good_support: float = 0.92
-    """A fit with less support than this is tried again from turned starts."""
+    good_support: float = 0.95
+    """A fit with less support than this is tried again from turned starts ..."""
+    good_misfit: float = 1.3
+    """... and so is one with a larger misfit than this."""
     retry_angle: float = np.deg2rad(14.0)
     """How far those starts are turned, radians."""
     align_reach: float = 0.3
@@ -64,7 +66,7 @@ class Prober:
     def __init__(self, registration: RegistrationConfig, fit: FitConfig) -> None:
         wide = Step(gate=0.06, kernel=16.0, edge_reach=18, silhouettes="always")
         schedule = (wide, wide, *registration.schedule)
-        probe = replace(registration, schedule=schedule, max_rays=registration.max_rays // 2)
+        probe = replace(registration, schedule=schedule)
         self._fit = fit
         self._coarse = [replace(step, repeats=1) for step in (wide, *schedule[:5])]
         self._refine = schedule[3:]
@@ -87,10 +89,13 @@ class Prober:
         self._show(model)
         starts = [self._align_depth(h.T_camera_object, depth, intrinsics) for h in hypotheses]
         result = self._best_of(starts, depth, intrinsics)
-        if result is None or result.support < self._fit.good_support:
+        if result is None or not self._good(result):
             turned = [_turned(starts[0], axis, sign * self._fit.retry_angle) for axis in range(3) for sign in (1, -1)]
             result = min((r for r in (result, self._best_of(turned, depth, intrinsics)) if r), key=cost, default=None)
         return result if result is not None and believable(result, self._fit) else None
+
+    def _good(self, result: RegistrationResult) -> bool:
+        return result.support >= self._fit.good_support and result.misfit <= self._fit.good_misfit
 
     def _best_of(
         self, starts: Sequence[Float64], depth: Float32, intrinsics: CameraIntrinsics

@@ -1,8 +1,8 @@
 """Correspondences between a depth image and ray-traced models, and their normal equations.
 
-Tracking paper, III.B: with the exact sensor model, each measured point ``D_i(P)`` is paired with the model point that its
-own viewing ray hits, ``D_i(P) -> M_i(P, N, O)``: position, normal and instance. All instances stand in one scene, so
-occlusion between objects is handled by construction. Beyond the paper, silhouette pixels add the offset between the
+Tracking paper, III.B: with the exact sensor model, each measured point ``D_i(P)`` is paired with the model point that
+its own viewing ray hits, ``D_i(P) -> M_i(P, N, O)``: position, normal and instance. All instances stand in one scene,
+so occlusion between objects is handled by construction. Beyond the paper, silhouette pixels add the offset between the
 model's edge and the depth discontinuity, which constrains what the visible faces leave free.
 
 Everything here is in the camera frame. Sums run in a fixed order.
@@ -64,7 +64,9 @@ def point_correspondences(
         gates: (K,) largest distance along the normal, metres.
         model_sigma: surface error of the models, metres.
         focal_baseline: focal length times baseline of the depth sensor, px m.
-        measured, model, normal: (M, 3) outputs, metres.
+        measured: (M, 3) output, metres.
+        model: (M, 3) output, metres.
+        normal: (M, 3) output, unit vectors.
         weight: (M,) output, inverse variance along the normal, 1/m^2.
         owner: (M,) output, row of the instance.
         counts: (K, FIELDS) output, rays by verdict.
@@ -113,7 +115,7 @@ def point_correspondences(
 
 @njit(cache=True, nogil=True)
 def _edge_offset(depth, model_depth, model_instance, k, u, v, du, dv, z, reach, step_depth, tolerance):
-    """Offset in pixels along (du, dv) from pixel (u, v) to the depth discontinuity nearest to it; NaN if there is none."""
+    """Offset in pixels along (du, dv) from pixel (u, v) to the nearest depth discontinuity; NaN if there is none."""
     height, width = depth.shape
     best = np.nan
     last_on, run = -1000, 0
@@ -146,8 +148,8 @@ def edge_correspondences(
     """Pair the models' silhouettes with depth discontinuities; returns the number of pairs.
 
     For a silhouette pixel with outward image direction d the measured discontinuity is sought along d. Outputs:
-    `point` (M, 3) model point, metres; `direction` (M, 2) d; `offset` (M,) pixels that the silhouette has to move along d;
-    `weight` (M,) 1/px^2; `owner` (M,) row of the instance.
+    `point` (M, 3) model point, metres; `direction` (M, 2) d; `offset` (M,) pixels that the silhouette has to move
+    along d; `weight` (M,) 1/px^2; `owner` (M,) row of the instance.
     """
     height, width = depth.shape
     found = 0
@@ -201,10 +203,11 @@ def edge_correspondences(
 def point_normal_equations(measured, model, normal, weight, owner, centres, rotations, shifts, kernel, H, g, stats):
     """Accumulate robust point-to-plane normal equations of every instance.
 
-    The models have moved since the cast by ``m' = c + R (m - c) + t`` about their `centres` (K, 3); `rotations` (K, 3, 3),
-    `shifts` (K, 3). Residual ``r = n . (p - m')``, Geman-McClure weights with scale `kernel` (K,) in standard deviations.
-    Outputs: `H` (K, 6, 6) and `g` (K, 6) with ``H xi = g``; `stats` (K, 3): weighted pairs, sum of w r^2 in units of the
-    variance, sum of squared residuals of inliers in m^2.
+    The models have moved since the cast by ``m' = c + R (m - c) + t`` about their `centres` (K, 3); `rotations` (K, 3,
+    3), `shifts` (K, 3). Residual ``r = n . (p - m')``, Geman-McClure weights with scale `kernel` (K,) in standard
+    deviations.
+    Outputs: `H` (K, 6, 6) and `g` (K, 6) with ``H xi = g``; `stats` (K, 3): weighted pairs, sum of w r^2 in units of
+    the variance, sum of squared residuals of inliers in m^2.
     """
     J = np.empty(6)
     for i in range(owner.shape[0]):
@@ -243,8 +246,8 @@ def edge_normal_equations(
 ):  # fmt: skip
     """Accumulate the normal equations of silhouette offsets, which move the models' edges in the image.
 
-    As `point_normal_equations`; residual in pixels ``r = offset - d . (proj(m') - proj(m))``; `stats` (K, 2): pairs, sum
-    of w r^2.
+    As `point_normal_equations`; residual in pixels ``r = offset - d . (proj(m') - proj(m))``; `stats` (K, 2): pairs,
+    sum of w r^2.
     """
     J = np.empty(6)
     for i in range(owner.shape[0]):
@@ -310,7 +313,7 @@ def umeyama_sums(measured, model, normal, owner, centres, rotations, shifts, cou
 
 @njit(cache=True, nogil=True)
 def ray_differences(pixels, distances, instances, depth, row, reach, out):
-    """Measured minus model depth on the rays that hit instance `row`, where within `reach` metres; returns their number."""
+    """Measured minus model depth on rays that hit instance `row`, where within `reach` metres; returns how many."""
     width = depth.shape[1]
     found = 0
     for i in range(pixels.shape[0]):

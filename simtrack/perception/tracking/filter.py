@@ -1,8 +1,9 @@
 """A Kalman filter for the pose of one object: what the tracking paper names as its future work.
 
-State: pose in the map and velocity, with a 12x12 covariance of (translation, rotation vector, linear, angular velocity),
-perturbing on the left in the map frame. Two motion models take turns: an object that stands still does not move at all, one
-that moves has a white-noise acceleration. Which holds is decided by the innovations. Late measurements are fused at their
+State: pose in the map and velocity, with a 12x12 covariance of (translation, rotation vector, linear, angular
+velocity), perturbing on the left in the map frame. Two motion models take turns: an object that stands still does not
+move at all, one that moves has a white-noise acceleration. Which holds is decided by the innovations. Late
+measurements are fused at their
 own stamp: the filter keeps its recent past and replays it.
 """
 

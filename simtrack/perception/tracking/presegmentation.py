@@ -267,12 +267,12 @@ def _cluster_points(points: Float64, distance: float, min_points: int) -> tuple[
     """Euclidean clusters of (N, 3) points: labels from 1 (0 = in no cluster of `min_points`) and their number."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     labels = np.zeros(len(points), np.int32)
     if len(points) < min_points:
         return labels, 0
-    pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
+    pairs = KDTree(points).query_pairs(distance, output_type="ndarray")
     ones = np.ones(len(pairs), bool)
     graph = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
     _, component = connected_components(graph, directed=False)

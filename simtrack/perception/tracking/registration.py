@@ -1,8 +1,9 @@
 """Registration of all visible models to one depth image by ray tracing (tracking paper, III.B).
 
-Each outer iteration casts the rays of the models' image windows against the scene of instances, pairs measured with model
-points, and moves every instance by a few Gauss-Newton steps on robust point-to-plane and silhouette residuals, or by the
-paper's Umeyama fits. Directions that the data do not constrain are found from the information matrix and not moved.
+Each outer iteration casts the rays of the models' image windows against the scene of instances, pairs measured with
+model points, and moves every instance by a few Gauss-Newton steps on robust point-to-plane and silhouette residuals,
+or by the paper's Umeyama fits. Directions that the data do not constrain are found from the information matrix and not
+moved.
 """
 
 from collections.abc import Mapping, Sequence
@@ -133,6 +134,8 @@ class RegistrationResult:
     """Pixel grid of the instance: a ray stands for stride x stride pixels."""
     residual: float
     """Metres: RMS of the inliers along the normal."""
+    misfit: float
+    """Mean squared residual of the inliers in units of the sensor model's variance: about 1 or less for a good fit."""
     edges: int
     """Silhouette pixels used."""
 
@@ -395,6 +398,7 @@ class _Batch:
             out[instance] = RegistrationResult(
                 T, covariance, int(self._constrained[k]), supported + occluded + missing + invalid, supported,
                 occluded, missing, invalid, int(self._strides[k]), float(np.sqrt(self._stats[k, 2] / inliers)),
+                float(self._stats[k, 1]) / inliers,
                 int(np.count_nonzero(self._edge_owner == k)),
             )  # fmt: skip
         return out

@@ -80,23 +80,13 @@ def gauss_newton(
 ):  # fmt: skip
     """Move every instance by `iterations` steps (0: only judge), then leave what is known at the last pose.
 
-    Args:
-        measured, model, normal, weight, owner: from `point_correspondences`.
-        edge_point, edge_direction, edge_offset, edge_weight, edge_owner: from `edge_correspondences`.
-        camera: (4,) fx, fy, cx, cy.
-        centres: (K, 3) object origins at the time of the cast, camera frame.
-        rotations, shifts: (K, 3, 3), (K, 3), in and out: motion since the cast, about the centres.
-        radii: (K,) metres.
-        correlation: (K, 2) readings, and silhouette pixels, that count as one.
-        kernel, edge_kernel: scales of the robust kernels, standard deviations.
-        edges: `EDGES_NEVER`, `EDGES_WHERE_OPEN` or `EDGES_ALWAYS`.
-        edge_sigma, unconstrained_sigma: metres, see `combine` and `constrained_solution`.
-        max_shift, max_turn: limits of a step, metres and radians.
-        iterations: number of steps.
-        covariance: (K, 6, 6) out.
-        constrained: (K,) out, number of constrained directions.
-        stats: (K, 3) out, see `point_normal_equations`.
-
+    The first five arrays come from `point_correspondences`, the next five from `edge_correspondences`; `camera` (4,) is
+    fx, fy, cx, cy; `centres` (K, 3) are the objects' origins at the time of the cast. In and out: `rotations` (K, 3, 3)
+    and `shifts` (K, 3), the motion since the cast about the centres. `radii` (K,), metres; `correlation` (K, 2):
+    readings, and silhouette pixels, that count as one; `kernel`, `edge_kernel`: scales of the robust kernels in
+    standard deviations; `edges`: when silhouettes take part; `edge_sigma`, `unconstrained_sigma`: see `combine` and
+    `constrained_solution`; `max_shift`, `max_turn`: limits of a step, metres and radians. Out: `covariance` (K, 6, 6),
+    `constrained` (K,) number of constrained directions, `stats` (K, 3) of `point_normal_equations`.
     """
     K = centres.shape[0]
     kernels = np.full(K, kernel)

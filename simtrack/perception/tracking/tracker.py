@@ -1,9 +1,9 @@
 """Tracks of objects with known models: registration, filtering, data association and life cycle.
 
-Per frame (tracking paper, III.B): all tracked instances stand in one scene; rays are traced, each instance is registered
-to the depth image and its filter takes the result. Rays say what became of an object that is not confirmed: something in
-front of it (occluded: kept) or nothing where its surface should be (gone: pruned). Detections arrive late; they are
-matched, born and fused at the stamp of their image and replayed through the depth images since.
+Per frame (tracking paper, III.B): all tracked instances stand in one scene; rays are traced, each instance is
+registered to the depth image and its filter takes the result. Rays say what became of an object that is not confirmed:
+something in front of it (occluded: kept) or nothing where its surface should be (gone: pruned). Detections arrive
+late; they are matched, born and fused at the stamp of their image and replayed through the depth images since.
 """
 
 from collections import deque

@@ -1,4 +1,4 @@
-"""An agent that wants to know where everything is: it explores surfaces, follows what moves, and looks for what is lost."""
+"""An agent that wants to know where everything is: it explores, follows what moves, and looks for what is lost."""
 
 from dataclasses import dataclass
 
@@ -159,9 +159,7 @@ class ExplorerAgent:
     def _near(self, point: Float64, tracks: tuple[Track, ...]) -> Float64:
         """Mean position of the believed objects within 1.2 m of a point; the point itself if there is none."""
         close = [
-            t.T_map_object[:3, 3]
-            for t in tracks
-            if t.believed and np.linalg.norm(t.T_map_object[:3, 3] - point) < 1.2
+            t.T_map_object[:3, 3] for t in tracks if t.believed and np.linalg.norm(t.T_map_object[:3, 3] - point) < 1.2
         ]
         return np.mean(close, axis=0) if close else point
 
@@ -217,7 +215,9 @@ class ExplorerAgent:
         if path is not None and np.linalg.norm(path[-1] - T_map_base[:2, 3]) > 0.12:
             linear, angular = self._follow(path, T_map_base)
         elif abs(pan) > 0.9:
-            angular = float(np.clip(1.5 * (pan - np.sign(pan) * 0.5), -self.config.max_angular, self.config.max_angular))
+            angular = float(
+                np.clip(1.5 * (pan - np.sign(pan) * 0.5), -self.config.max_angular, self.config.max_angular)
+            )
         return Command(linear, angular, *clipped(pan, tilt), self._posture.torso)
 
     def _follow(self, path: Float64, T_map_base: Float64) -> tuple[float, float]:
@@ -247,4 +247,3 @@ class _Viewpoint:
 
 def _middle(patches: list[Patch]) -> Float64:
     return np.mean([p.centre for p in patches], axis=0)
-
