@@ -61,8 +61,8 @@ class DepthNoiseConfig:
     quantisation_baseline: float = 0.075
     """Metres, with which disparity is computed."""
     shadow_baseline: float = 0.075
-    """Metres from camera to projector along +x of the image; what the projector cannot see has no reading. 0 = off.
-    Only what is in the image casts a shadow."""
+    """Metres from camera to projector along +x of the image, negative for one on the other side; what the projector
+    cannot see has no reading. 0 = off. Only what is in the image casts a shadow."""
     grazing_dropout: float = np.deg2rad(82.0)
     """Radians of incidence at which half of the readings are lost; pi/2 = off. A choice of this project."""
     grazing_width: float = np.deg2rad(1.5)
@@ -84,7 +84,7 @@ class DepthNoiseConfig:
     def __post_init__(self) -> None:
         amounts = (
             "axial_offset axial_quadratic axial_origin axial_grazing lateral_sigma lateral_grazing edge_disparity "
-            "disparity_step shadow_baseline albedo_floor"
+            "disparity_step albedo_floor"
         )
         for name in amounts.split():
             if not 0 <= getattr(self, name) < np.inf:
@@ -100,6 +100,8 @@ class DepthNoiseConfig:
             raise InvalidValueError("max_incidence, grazing_dropout", value, "radians below pi/2 (dropout: up to pi/2)")
         if self.correlation_window < 1 or self.correlation_window % 2 == 0:
             raise InvalidValueError("correlation_window", self.correlation_window, "an odd number of pixels >= 1")
+        if not np.isfinite(self.shadow_baseline):
+            raise InvalidValueError("shadow_baseline", self.shadow_baseline, "finite metres")
         if self.lateral not in LATERAL_MODES:
             raise UnknownNameError("lateral mode", self.lateral, LATERAL_MODES)
         if not 0 <= self.min_range < self.max_range:
@@ -212,8 +214,14 @@ def apply_depth_noise(
     else:
         cosines = kernels.cosines_from_normals(np.ascontiguousarray(normals, np.float32), *camera)
     hidden, source, dark = np.zeros(shape, np.bool_), np.empty(0, np.int32), np.empty(0, np.float32)
-    if config.shadow_baseline > 0:
-        hidden = kernels.projector_shadow(inverse, np.float32(intrinsics.fx * config.shadow_baseline))
+    if config.shadow_baseline != 0:
+        side = (
+            1 if config.shadow_baseline > 0 else -1
+        )  # a projector on the left is one on the right of the mirror image
+        reach = np.float32(intrinsics.fx * abs(config.shadow_baseline))
+        hidden = np.ascontiguousarray(
+            kernels.projector_shadow(np.ascontiguousarray(inverse[:, ::side]), reach)[:, ::side]
+        )
     if config.lateral != "none" or config.flying_pixels > 0:
         threshold = np.float32(config.edge_disparity / (config.focal * config.quantisation_baseline))
         edges = kernels.depth_edges(inverse, threshold)

@@ -1,6 +1,8 @@
 """Depth noise: marginal laws, correlation, shadows, losses, and a real PrimeSense camera."""
 
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +20,12 @@ from simtrack.sensors.depth_noise import (
 )
 
 CAMERA = XTION.intrinsics
-AXIAL_ONLY = {
-    "lateral": "none", "shadow_baseline": 0.0, "grazing_dropout": np.pi / 2, "dropout": 0.0, "albedo_floor": 0.0,
-}  # fmt: skip
+
+
+def only_axial(**changes: Any) -> DepthNoiseConfig:
+    """The default preset with nothing but axial noise and rounding, and then the given changes."""
+    off = {"lateral": "none", "shadow_baseline": 0.0, "grazing_dropout": np.pi / 2, "dropout": 0.0, "albedo_floor": 0.0}
+    return DepthNoiseConfig(**(off | changes))
 
 
 def plane(normal: tuple[float, float, float], z: float, camera: CameraIntrinsics = CAMERA) -> np.ndarray:
@@ -36,7 +41,7 @@ def rng() -> np.random.Generator:
 @pytest.mark.parametrize("z", [0.6, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("step", [0.0, 0.125])
 def test_marginal_sigma_is_the_models_with_and_without_rounding(z: float, step: float) -> None:
-    config = DepthNoiseConfig(**AXIAL_ONLY, disparity_step=step)
+    config = only_axial(disparity_step=step)
     errors = apply_depth_noise(plane((0, 0, 1), z), None, CAMERA, config, rng()) - z
     assert errors.std() == pytest.approx(float(axial_sigma(z)), rel=0.06 if step else 0.03)
     assert abs(errors.mean()) < 0.1 * float(axial_sigma(z))
@@ -47,7 +52,7 @@ def test_sigma_grows_with_incidence_as_nguyen_says() -> None:
     depth = plane((np.sin(tilt), 0, -np.cos(tilt)), 1.5)
     middle = (slice(200, 280), slice(315, 325))
     camera = CAMERA
-    errors = apply_depth_noise(depth, None, camera, DepthNoiseConfig(**AXIAL_ONLY, disparity_step=0.0), rng()) - depth
+    errors = apply_depth_noise(depth, None, camera, only_axial(disparity_step=0.0), rng()) - depth
     expected = float(axial_sigma(1.5, tilt))
     assert expected > 1.3 * float(axial_sigma(1.5))
     assert errors[middle].std() == pytest.approx(expected, rel=0.15)
@@ -69,7 +74,7 @@ def test_incidence_from_differences_equals_incidence_from_normals() -> None:
 
 
 def test_correlation_is_as_stated() -> None:
-    config = DepthNoiseConfig(**AXIAL_ONLY, disparity_step=0.0, correlated_share=0.4, correlation_window=9)
+    config = only_axial(disparity_step=0.0, correlated_share=0.4, correlation_window=9)
     errors = apply_depth_noise(plane((0, 0, 1), 2.0), None, CAMERA, config, rng()) - 2.0
     errors /= errors.std()
 
@@ -79,7 +84,7 @@ def test_correlation_is_as_stated() -> None:
     assert 0.3 < correlation(1) < 0.4  # 0.4 times that of the binomial window at lag 1
     assert correlation(1) > correlation(3) > correlation(5) > -0.02
     assert abs(correlation(9)) < 0.02  # the window's width ends it
-    white = DepthNoiseConfig(**AXIAL_ONLY, disparity_step=0.0, correlated_share=0.0)
+    white = only_axial(disparity_step=0.0, correlated_share=0.0)
     errors = apply_depth_noise(plane((0, 0, 1), 2.0), None, CAMERA, white, rng()) - 2.0
     assert abs(correlation(1)) < 0.02
 
@@ -98,13 +103,16 @@ def step_scene(front: float, back: float) -> np.ndarray:
 
 
 def test_the_projectors_shadow_is_as_wide_as_geometry_says() -> None:
-    config = DepthNoiseConfig(**(AXIAL_ONLY | {"shadow_baseline": 0.075}), axial_offset=0.0, axial_quadratic=0.0)
+    config = only_axial(shadow_baseline=0.075, axial_offset=0.0, axial_quadratic=0.0)
     readings = apply_depth_noise(step_scene(1.0, 3.0), None, CAMERA, config, rng())
     row = readings[250] == 0
     width = 577.0 * 0.075 * (1 - 1 / 3)
     assert np.flatnonzero(row).max() == 299  # the projector stands at +x, so the shadow falls on the left
     assert row.sum() == pytest.approx(width, abs=1.5)
     assert not (readings[100] == 0).any()
+    other = only_axial(shadow_baseline=-0.075, axial_offset=0.0, axial_quadratic=0.0)
+    mirrored = apply_depth_noise(step_scene(1.0, 3.0), None, CAMERA, other, rng())[250] == 0
+    assert np.flatnonzero(mirrored).min() == 420 and mirrored.sum() == row.sum()
     thin = np.full((480, 640), 3.0, np.float32)
     thin[:, 400:406] = 1.0
     row = apply_depth_noise(thin, None, CAMERA, config, rng())[250] == 0
@@ -116,9 +124,7 @@ def test_the_projectors_shadow_is_as_wide_as_geometry_says() -> None:
 
 
 def test_lateral_jitter_stays_at_depth_edges() -> None:
-    config = DepthNoiseConfig(
-        **(AXIAL_ONLY | {"lateral": "edges"}), axial_offset=0, axial_quadratic=0, disparity_step=0
-    )
+    config = only_axial(lateral="edges", axial_offset=0, axial_quadratic=0, disparity_step=0)
     depth = step_scene(1.0, 1.2)
     changed = apply_depth_noise(depth, None, CAMERA, config, rng()) != depth
     rows, columns = np.nonzero(changed)
@@ -223,3 +229,48 @@ def test_impossible_noise_is_refused(change: dict, error: type[Exception]) -> No
         preset("kinect_v9")
     with pytest.raises(InvalidValueError, match="depth_true"):
         apply_depth_noise(np.zeros((2, 2), np.float32), None, CAMERA, PRESETS["ideal"], rng())
+
+
+def plane_residuals(depth: np.ndarray, camera: CameraIntrinsics, size: int = 41) -> np.ndarray:
+    """(K, 3): depth in metres, RMS residual in metres and correlation at 3 px of patches that are nearly planar.
+
+    A plane and a faint curvature are fitted to inverse depth: lens and calibration errors are not noise.
+    """
+    v, u = np.mgrid[:size, :size].astype(float) / size
+    basis = np.linalg.qr(np.stack([np.ones_like(u), u, v, u * u, v * v, u * v], -1).reshape(-1, 6))[0]
+    rows = []
+    for top in range(0, camera.height - size, 20):
+        for left in range(0, camera.width - size, 20):
+            patch = depth[top : top + size, left : left + size].astype(float)
+            if (patch <= 0).any():
+                continue
+            inverse = 1.0 / patch.ravel()
+            residual = ((inverse - basis @ (basis.T @ inverse)) * patch.ravel() ** 2).reshape(size, size)
+            sigma = residual.std()
+            rows.append((patch.mean(), sigma, (residual[:, 3:] * residual[:, :-3]).mean() / sigma**2))
+    return np.array(rows)
+
+
+def test_a_real_primesense_camera_is_as_noisy(real_data: Path) -> None:
+    """Walls at 1.7 to 2.7 m in five frames; the flattest patches, since furniture is no noise."""
+    import cv2
+
+    files = sorted((real_data / "open3d_rgbd" / "depth").glob("*.png"))
+    if not files:
+        pytest.skip(f"no depth images in {real_data / 'open3d_rgbd'}")
+    camera = CameraIntrinsics(640, 480, 525.0, 525.0, 319.5, 239.5)
+    images = [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)) / 1000.0 for file in files]
+    real = np.concatenate([plane_residuals(image, camera) for image in images])
+    checked = 0
+    for near, far in ((1.7, 2.0), (2.0, 2.3), (2.3, 2.7)):
+        patches = real[(real[:, 0] >= near) & (real[:, 0] < far)]
+        flat = patches[patches[:, 1] < np.quantile(patches[:, 1], 0.25)]
+        z = float(np.median(flat[:, 0]))
+        simulated = plane_residuals(
+            apply_depth_noise(plane((0, 0, 1), z), None, camera, PRESETS["xtion"], rng()), camera
+        )
+        ratio = np.median(simulated[:, 1]) / np.median(flat[:, 1])
+        assert 0.5 < ratio < 2.0, f"at {z:.2f} m the model's noise is {ratio:.2f} times the real one"
+        assert abs(np.median(simulated[:, 2]) - np.median(flat[:, 2])) < 0.25
+        checked += len(flat)
+    assert checked > 100

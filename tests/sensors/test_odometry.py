@@ -24,10 +24,9 @@ def drive(config: OdometryNoiseConfig, seed: int, rate_hz: float = 50.0, metres:
 def test_without_noise_it_is_the_motion_since_the_start() -> None:
     sensor = OdometrySensor(QUIET, np.random.default_rng(0))
     start = transform_planar(3.0, -2.0, 1.0)
-    for i in range(400):  # an arc of radius 0.5 m
-        angle = 0.02 * i
-        T = start @ transform_planar(0.5 * np.sin(angle), 0.5 * (1 - np.cos(angle)), angle)
-        reading = sensor.read(i * sensor.period, T)
+    angles = 0.02 * np.arange(400)  # an arc of radius 0.5 m
+    poses = [start @ transform_planar(0.5 * np.sin(a), 0.5 * (1 - np.cos(a)), a) for a in angles]
+    reading, T = [sensor.read(i * sensor.period, pose) for i, pose in enumerate(poses)][-1], poses[-1]
     np.testing.assert_allclose(reading.T_odom_base, np.linalg.inv(start) @ T, atol=1e-3)
     assert reading.linear == pytest.approx(0.5, rel=1e-3) and reading.angular == pytest.approx(1.0, rel=1e-9)
 
