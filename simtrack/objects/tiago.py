@@ -100,7 +100,7 @@ def _fixed(name: str) -> Joint:
 
 def _body() -> list[Link]:
     at = transform_xyz_rpy
-    column = _rounded((-0.17, -0.11, 0.28), (0.05, 0.11, 0.72), 0.04)
+    column = _rounded((-0.13, -0.11, 0.28), (0.05, 0.11, 0.72), 0.04)
     badge = _rounded((0.12, -0.06, -0.02), (0.142, 0.06, 0.05), 0.01)
     return [
         _link("base", "", None, np.eye(4), _lathe((0.25, 0.09), (0.27, 0.12), (0.27, 0.24), (0.21, 0.3)), 38.5),
@@ -108,7 +108,7 @@ def _body() -> list[Link]:
         _link("column", "base", _fixed("column"), np.eye(4), column, 8.0, GREY),
         _link(
             "torso", "base", Joint(TORSO, "prismatic", Z, 0.0, 0.35, 0.07), at((-0.062, 0.0, 0.79)),
-            _rounded((-0.13, -0.15, -0.20), (0.135, 0.15, 0.11), 0.06), 9.0,
+            _rounded((-0.08, -0.135, -0.20), (0.135, 0.135, 0.11), 0.06), 9.0,
         ),
         _link("badge", "torso", _fixed("badge"), np.eye(4), badge, 0.1, BLUE),
         _link(
@@ -130,7 +130,7 @@ def _body() -> list[Link]:
 
 def _lidar() -> list[Link]:
     """The VLP-16 (103.3 mm wide, 71.7 mm high) on a mast, open where the laser leaves it."""
-    mast, centre = (-0.2, 0.0), 1.15
+    mast, centre = (-0.23, 0.0), 1.15
     base = _lathe((0.0516, centre - 0.036), (0.0516, centre - 0.017), at=mast)
     cap = _lathe((0.0516, centre + 0.017), (0.0516, centre + 0.036), at=mast)
     fixed = np.eye(4)

@@ -12,7 +12,7 @@ from simtrack.errors import UnknownNameError
 from simtrack.geometry.transforms import apply, difference, inverse
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 from simtrack.simulation.history import KEY_NS, History
-from simtrack.simulation.world import COLLISION, SENSOR_BODIES, World, body_pose
+from simtrack.simulation.world import SENSOR_BODIES, World, body_pose
 from simtrack.simulation.world_rays import WorldRays
 
 if TYPE_CHECKING:
@@ -262,9 +262,9 @@ class _ContactLog:
 
     def __init__(self, world: World) -> None:
         names = world.names
-        index = {name: k for k, name in enumerate(names)}
         self._names = names
-        self._owner = _owners_of_collision_geoms(world, index)
+        robot = [k for k, name in enumerate(names) if name == "robot"]
+        self._owner = np.where(np.isin(world.geom_owners, robot), -1, world.geom_owners)
         self._is_object = np.array([name in world.objects for name in names])
         self._keys: list[int] = []
         self._sets: list[tuple[np.ndarray, np.ndarray]] = []
@@ -302,18 +302,3 @@ class _ContactLog:
 
         pairs = frozenset((a, b) if a < b else (b, a) for a, b in map(named, touches))
         return frozenset(map(named, supports)), pairs
-
-
-def _owners_of_collision_geoms(world: World, index: Mapping[str, int]) -> Int32:
-    """(ngeom,), index of the thing that a collision geom belongs to, -1 for the robot and for what is unnamed."""
-    import mujoco
-
-    model = world.model
-    by_body = {instance.body: instance.name for instance in world.instances if instance.body != 0}
-    owners = np.full(model.ngeom, -1, np.int32)
-    for geom in np.flatnonzero(model.geom_group == COLLISION):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, int(geom)) or ""
-        body = int(model.geom_bodyid[geom])
-        owner = by_body.get(body, name.removeprefix("static/").rpartition("#")[0])
-        owners[geom] = -1 if owner == "robot" else index.get(owner, -1)
-    return owners

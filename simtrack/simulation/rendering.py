@@ -95,11 +95,7 @@ class MujocoRenderer:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = world.model.camera("camera").id
         self._half = np.array([intrinsics.width, intrinsics.height]) / (2 * intrinsics.fx)
-        self._name_of_geom = np.full(world.model.ngeom + 1, -1, np.int32)
-        index = {name: k for k, name in enumerate(world.names)}
-        names = _names_of_geoms(world)
-        for geom, name in names.items():
-            self._name_of_geom[geom] = index[name]
+        self._owners = np.append(world.geom_owners, np.int32(-1))
         self._color = np.empty((*self._size, 3), np.uint8)
         self._buffer = np.empty(self._size, np.float32)
 
@@ -121,7 +117,7 @@ class MujocoRenderer:
         for k in range(self._scene.ngeom):
             shape = self._scene.geoms[k]
             geom_of_code[shape.segid + 1] = shape.objid
-        return self._name_of_geom[geom_of_code[code]]
+        return self._owners[geom_of_code[code]]
 
     def _draw(
         self, data: "mujoco.MjData", groups: tuple[int, int], far: float, *, segment: bool, color: bool, depth: bool
@@ -199,22 +195,6 @@ def _egl_context(model: "mujoco.MjModel", intrinsics: CameraIntrinsics):
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
     context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
     return gl, context
-
-
-def _names_of_geoms(world: World) -> dict[int, str]:
-    """Geom id -> instance name, for all visible geoms."""
-    import mujoco
-
-    model = world.model
-    by_body = {instance.body: instance.name for instance in world.instances if instance.body != 0}
-    found: dict[int, str] = {}
-    for geom in np.flatnonzero(model.geom_group != COLLISION):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, int(geom)) or ""
-        body = int(model.geom_bodyid[geom])
-        owner = by_body.get(body, name.removeprefix("static/"))
-        if owner in world.names:
-            found[int(geom)] = owner
-    return found
 
 
 class EmbreeRenderer:

@@ -263,7 +263,8 @@ class Simulation:
         self.truth.record_scan(stamp, self._rays.ids(hits))
         scan = LidarScan(
             stamp, shots.directions, ranges, shots.times, shots.rings,
-            np.where(np.isfinite(ranges), intensities, 0.0).astype(np.float32), self._T_base_lidar, self._counts["lidar"],
+            np.where(np.isfinite(ranges), intensities, 0.0).astype(np.float32), self._T_base_lidar,
+            self._counts["lidar"],
         )  # fmt: skip
         self._feed.send(self.calibration.apply(scan), stamp + self.lidar.period)
 

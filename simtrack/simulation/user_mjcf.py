@@ -1,4 +1,4 @@
-"""A user's MJCF file as a part of the world: checked, attached under a prefix, its shapes seen by both renderers alike."""
+"""A user's MJCF file as a part of the world: checked, attached under a prefix, its shapes seen by both renderers."""
 
 from collections.abc import Callable
 from pathlib import Path

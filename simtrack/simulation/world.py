@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from simtrack.contracts import Float64
+from simtrack.contracts import Float64, Int32
 from simtrack.errors import FileFormatError, InvalidValueError, UnknownNameError
 from simtrack.geometry.kinematics import KinematicTree, Link
 from simtrack.geometry.meshes import Mesh, area, painted
@@ -68,6 +68,8 @@ class World:
     instances: tuple[Instance, ...]
     names: tuple[str, ...]
     """Names of all instances, each once; ids in images index it."""
+    geom_owners: Int32
+    """(ngeom,), index into `names` of what each MuJoCo geom, seen or touched, belongs to; -1 = nothing named."""
     bodies: Mapping[str, int] = field(default_factory=dict)
     """Name of each movable thing -> MuJoCo body id (``hand`` is the palm, ``robot`` the base)."""
 
@@ -385,7 +387,24 @@ def _settled(
         Instance(name, kind, model.body(body).id, mesh, T) for name, kind, body, mesh, T in composer.instances
     )
     names = tuple(dict.fromkeys(instance.name for instance in instances))
-    return World(scene, seed, model, data, static, robot, controller, models, instances, names, bodies)
+    owners = _geom_owners(model, instances, names)
+    return World(scene, seed, model, data, static, robot, controller, models, instances, names, owners, bodies)
+
+
+def _geom_owners(model: "mujoco.MjModel", instances: tuple[Instance, ...], names: tuple[str, ...]) -> Int32:
+    import mujoco
+
+    index = {name: k for k, name in enumerate(names)}
+    by_body = {instance.body: index[instance.name] for instance in instances if instance.body != 0}
+    owners = np.full(model.ngeom, -1, np.int32)
+    for geom in range(model.ngeom):
+        if (body := int(model.geom_bodyid[geom])) != 0:
+            owners[geom] = by_body.get(body, -1)
+        else:
+            name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or ""
+            # Collision boxes and a user's shapes are numbered: "static/NAME#3".
+            owners[geom] = index.get(name.removeprefix("static/").partition("#")[0], -1)
+    return owners
 
 
 SENSOR_BODIES = {CAMERA: ROBOT + CAMERA, LIDAR: ROBOT + LIDAR}
