@@ -321,7 +321,7 @@ def sofa(depth: float = 0.85, width: float = 1.8, color: Color = BLUE) -> Furnit
     for k in range(seats):
         left = -y + arm + pitch * k
         a.block((-x + 0.2, left + 0.01, 0.28), (x - 0.01, left + pitch - 0.01, 0.43), GREY)
-    a.support(0.1, 0.0, 0.43, (depth - 0.25, width - 2 * arm))
+    a.support(0.095, 0.0, 0.43, (depth - 0.21, width - 2 * arm - 0.02))
     return a.finish()
 
 
