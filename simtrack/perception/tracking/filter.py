@@ -31,6 +31,8 @@ class FilterConfig:
     """A moving object comes to rest when its speed stays below this, m/s ..."""
     stop_angular_speed: float = 0.04
     """... and its angular speed below this, rad/s ..."""
+    stop_consistency: float = 2.0
+    """... or within this many times the variance of the velocity's estimate around zero ..."""
     stop_after: float = 0.25
     """... for this long, seconds."""
     max_speed: float = 2.0
@@ -169,11 +171,12 @@ class PoseFilter:
         if not state.moving:
             return replace(state, velocity=np.zeros(6))
         config = self.config
-        slow = np.linalg.norm(state.velocity[:3]) < config.stop_speed + np.sqrt(
-            np.trace(state.covariance[6:9, 6:9]) / 3
-        ) and np.linalg.norm(state.velocity[3:]) < config.stop_angular_speed + np.sqrt(
-            np.trace(state.covariance[9:, 9:]) / 3
-        )
+        limits = ((slice(0, 3), config.stop_speed), (slice(3, 6), config.stop_angular_speed))
+        slow = True
+        for part, limit in limits:
+            v, P = state.velocity[part], state.covariance[6:, 6:][part, part]
+            # slower than the limit, or not to be told from standing still
+            slow &= bool(np.linalg.norm(v) < limit or float(v @ np.linalg.solve(P, v)) < 3.0 * config.stop_consistency)
         if not slow:
             return replace(state, slow_since=state.stamp)
         if state.stamp - state.slow_since < config.stop_after * NANOSECONDS:

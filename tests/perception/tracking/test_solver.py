@@ -1,0 +1,102 @@
+import numpy as np
+
+from simtrack.geometry.transforms import exp_so3, perturb
+from simtrack.perception.tracking import solver
+from simtrack.perception.tracking.correspondences import edge_normal_equations, point_normal_equations
+
+CAMERA = np.array([577.0, 577.0, 319.5, 239.5])
+
+
+def test_rotation_equals_rodrigues() -> None:
+    rng = np.random.default_rng(0)
+    for phi in [*rng.standard_normal((5, 3)), np.zeros(3), 1e-9 * np.ones(3)]:
+        np.testing.assert_allclose(solver.rotation(phi), exp_so3(phi), atol=1e-12)
+
+
+def _points(rng: np.random.Generator, count: int = 40):
+    model = rng.uniform(-0.1, 0.1, (count, 3)) + [0, 0, 1.0]
+    normal = rng.standard_normal((count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return model + 0.002 * rng.standard_normal((count, 3)), model, normal
+
+
+def _residuals(measured, model, normal, centre, xi):
+    R = exp_so3(xi[3:])
+    moved = centre + (model - centre) @ R.T + xi[:3]
+    return np.einsum("ij,ij->i", normal @ R.T, measured - moved)
+
+
+def test_point_gradient_is_that_of_the_cost() -> None:
+    rng = np.random.default_rng(1)
+    measured, model, normal = _points(rng)
+    centre = np.array([0.01, -0.02, 1.0])
+    H, g, stats = np.zeros((1, 6, 6)), np.zeros((1, 6)), np.zeros((1, 3))
+    n = len(model)
+    point_normal_equations(
+        measured, model, normal, np.full(n, 1e4), np.zeros(n, np.int32), centre[None], np.eye(3)[None],
+        np.zeros((1, 3)), np.full(1, 1e6), H, g, stats,
+    )  # fmt: skip
+    step = 1e-6
+    for i in range(6):
+        xi = np.zeros(6)
+        xi[i] = step
+        plus = 0.5e4 * np.sum(_residuals(measured, model, normal, centre, xi) ** 2)
+        minus = 0.5e4 * np.sum(_residuals(measured, model, normal, centre, -xi) ** 2)
+        # H xi = g solves the step that lowers the cost, so g is the negative gradient; the normal's turn adds a
+        # second-order term that Gauss-Newton leaves out.
+        assert abs((minus - plus) / (2 * step) - g[0, i]) < 0.02 * np.abs(g).max() + 1e-3
+
+
+def test_silhouette_gradient_is_that_of_the_projection() -> None:
+    rng = np.random.default_rng(2)
+    count = 30
+    point = rng.uniform(-0.1, 0.1, (count, 3)) + [0, 0, 1.2]
+    direction = rng.standard_normal((count, 2))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    offset = rng.uniform(-2, 2, count)
+    centre = np.array([0.0, 0.02, 1.2])
+
+    def cost(xi: np.ndarray) -> float:
+        moved = centre + (point - centre) @ exp_so3(xi[3:]).T + xi[:3]
+        shift = CAMERA[:2] * (moved[:, :2] / moved[:, 2:] - point[:, :2] / point[:, 2:])
+        return 0.5 * float(np.sum((offset - np.einsum("ij,ij->i", direction, shift)) ** 2))
+
+    H, g, stats = np.zeros((1, 6, 6)), np.zeros((1, 6)), np.zeros((1, 2))
+    edge_normal_equations(
+        point, direction, offset, np.ones(count), np.zeros(count, np.int32), CAMERA, centre[None], np.eye(3)[None],
+        np.zeros((1, 3)), 1e6, H, g, stats,
+    )  # fmt: skip
+    for i in range(6):
+        xi = np.zeros(6)
+        xi[i] = 1e-6
+        assert np.isclose((cost(-xi) - cost(xi)) / 2e-6, g[0, i], rtol=1e-3, atol=1e-2)
+
+
+def test_unconstrained_directions_are_not_moved() -> None:
+    H = np.diag([1e6, 1e6, 1e6, 1e6, 1e6, 1.0])
+    step, covariance, constrained = solver.constrained_solution(H, np.ones(6), 0.01)
+    assert constrained == 5
+    assert step[5] == 0.0
+    np.testing.assert_allclose(step[:5], 1e-6)
+    np.testing.assert_allclose(covariance[5, 5], 1.0)
+
+
+def test_silhouettes_speak_only_where_faces_are_silent() -> None:
+    H = np.diag([1e8, 0.0, 0.0, 1e8, 0.0, 0.0])
+    H_edge, g_edge = np.diag(np.full(6, 1e4)), np.ones(6)
+    A, b = solver.combine(H, np.zeros(6), H_edge, g_edge, solver.EDGES_WHERE_OPEN, 0.0015)
+    np.testing.assert_allclose(b, [0, 1, 1, 0, 1, 1], atol=1e-6)
+    np.testing.assert_allclose(np.diag(A), [1e8, 1e4, 1e4, 1e8, 1e4, 1e4], rtol=1e-6)
+
+
+def test_umeyama_recovers_a_rigid_motion() -> None:
+    rng = np.random.default_rng(3)
+    _, model, normal = _points(rng, 400)
+    centre = np.array([0.0, 0.0, 1.0])
+    xi = np.array([0.004, -0.003, 0.002, 0.02, -0.01, 0.015])
+    measured = centre + (model - centre) @ exp_so3(xi[3:]).T + xi[:3]
+    rotations, shifts = np.eye(3)[None].copy(), np.zeros((1, 3))
+    solver.umeyama(measured, model, normal, np.zeros(400, np.int32), centre[None], rotations, shifts, 60)
+    T = perturb(np.eye(4), xi)
+    np.testing.assert_allclose(rotations[0], T[:3, :3], atol=1e-4)
+    np.testing.assert_allclose(shifts[0], xi[:3], atol=1e-4)
