@@ -8,7 +8,8 @@ import numpy as np
 from simtrack.contracts import Float32, Float64
 
 if TYPE_CHECKING:
-    from simtrack.raycast.scene import ClosestPoints, Instance, RayHits
+    from simtrack.raycast.hits import ClosestPoints, RayHits
+    from simtrack.raycast.scene import Instance
 
 
 def cast(

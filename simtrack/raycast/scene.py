@@ -13,57 +13,11 @@ from simtrack.errors import InvalidValueError, RaycastError
 from simtrack.raycast import embree as rtc
 from simtrack.raycast import fallback, kernels
 from simtrack.raycast.bundle import RayBundle
+from simtrack.raycast.hits import ClosestPoints, RayHits
 from simtrack.raycast.mesh import TriangleMesh
 
 MAX_INSTANCE = 1 << 16
 """Instance ids are below this: tables are indexed by them."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RayHits:
-    """What rays met, in the caller's order of rays."""
-
-    distances: Float32
-    """(N,), in multiples of the direction's length (metres for unit directions; depth for z = 1), inf = miss."""
-    normals: Float32
-    """(N, 3), unit, map frame, on the side that the mesh's winding faces; zero for a miss.
-
-    Normals move with the inverse transpose of the instance's transform, so the outside of a closed mesh stays its
-    outside under a mirroring transform too (as if the mirrored mesh's faces had been flipped, which trimesh does).
-    """
-    faces: Int32
-    """(N,), face index in the instance's mesh, -1 = miss."""
-    instances: Int32
-    """(N,), instance id, -1 = miss."""
-
-    @staticmethod
-    def empty(count: int) -> "RayHits":
-        """Uninitialised arrays for `count` rays, to be handed to `cast(..., out=)` again and again."""
-        return RayHits(
-            np.empty(count, np.float32),
-            np.empty((count, 3), np.float32),
-            np.empty(count, np.int32),
-            np.empty(count, np.int32),
-        )
-
-    @property
-    def hit(self) -> Bool:
-        """(N,), whether the ray met anything."""
-        return self.instances >= 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ClosestPoints:
-    """The nearest surface points, in the order of the query points."""
-
-    points: Float32
-    """(N, 3), map frame, metres; the query point itself where nothing lies within the maximum distance."""
-    distances: Float32
-    """(N,), metres, inf = nothing within the maximum distance."""
-    instances: Int32
-    """(N,), instance id, -1 = nothing."""
-    faces: Int32
-    """(N,), face index in the instance's mesh, -1 = nothing."""
 
 
 @dataclass(slots=True, eq=False)
@@ -234,7 +188,7 @@ class RayScene:
         """
         T = _checked_transforms(T_map_sensor, "T_map_sensor")[0]
         self.commit()
-        hits = _outputs(out, len(bundle))
+        hits = RayHits.reuse(out, len(bundle))
         rotation, origin = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
         limits = np.float32(min_distance), np.float32(max_distance)
         if self.fallback:
@@ -274,7 +228,7 @@ class RayScene:
         """
         rays = _checked_rays(origins, directions, times, packing)
         self.commit()
-        hits = _outputs(out, len(rays[0]))
+        hits = RayHits.reuse(out, len(rays[0]))
         limits = np.float32(min_distance), np.float32(max_distance)
         if self.fallback:
             fallback.cast(self._instances, *rays[:3], *limits, hits)
@@ -325,12 +279,7 @@ class RayScene:
             raise InvalidValueError("max_distance", max_distance, ">= 0")
         self.commit()
         count = len(queries)
-        found = ClosestPoints(
-            np.empty((count, 3), np.float32),
-            np.empty(count, np.float32),
-            np.empty(count, np.int32),
-            np.empty(count, np.int32),
-        )
+        found = ClosestPoints.empty(count)
         if self.fallback:
             fallback.closest(self._instances, queries, max_distance, found)
         elif count:
@@ -460,11 +409,3 @@ def _checked_rays(
     width = rtc.embree().packet_width if rtc.available() else 1
     order = np.minimum(np.arange(-(-count // width) * width, dtype=np.int32), np.int32(max(count - 1, 0)))
     return starts, rays, moments, order
-
-
-def _outputs(out: RayHits | None, count: int) -> RayHits:
-    if out is None:
-        return RayHits.empty(count)
-    if len(out.distances) != count:
-        raise InvalidValueError("out", len(out.distances), f"results for {count} rays")
-    return out
