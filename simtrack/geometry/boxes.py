@@ -19,7 +19,7 @@ from simtrack.geometry.transforms import is_rigid
 _PARALLEL = 1e-12
 """Squared sine below which two edges count as parallel: their cross product is no axis of its own."""
 _TIGHT = 1e-10
-"""Metres: a distance this close to its lower bound is the minimum."""
+"""Metres: lengths that differ by less are equal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,7 +265,7 @@ def _clip(p, u, c, R, h):
         start = (p[0] - c[0]) * R[0, axis] + (p[1] - c[1]) * R[1, axis] + (p[2] - c[2]) * R[2, axis]
         rate = u[0] * R[0, axis] + u[1] * R[1, axis] + u[2] * R[2, axis]
         if abs(rate) < 1e-15:
-            if abs(start) > h[axis]:
+            if abs(start) > h[axis] + _TIGHT:
                 return np.inf, 0.5
             continue
         s0 = (-h[axis] - start) / rate

@@ -1,6 +1,6 @@
 """Scene graph: entities, support tree, spatial relations that are kept live, their history, and queries.
 
-    graph = SceneGraph(static_map, models, parents=SEMANTIC_CLASSES)
+    graph = SceneGraph(static_map, models)
     graph.update(stamp, tracks)
     graph.query(relation="on", reference="workbench")
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from simtrack.perception.scene_graph.shapes import (
         HeightField,
         Interior,
+        ModelLike,
         Shape,
         box_shape,
         map_entity_shape,
@@ -38,7 +39,7 @@ _HOME = {
     "history": ("Event", "History", "Interval"),
     "query": ("Query", "parse_query"),
     "relations": ("DIRECTIONS", "RELATIONS", "Body", "RelationConfig", "relation_margin", "relation_margins"),
-    "shapes": ("HeightField", "Interior", "Shape", "box_shape", "map_entity_shape", "model_shape"),
+    "shapes": ("HeightField", "Interior", "ModelLike", "Shape", "box_shape", "map_entity_shape", "model_shape"),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
 
@@ -53,6 +54,7 @@ __all__ = [
     "Interior",
     "Interval",
     "Layer",
+    "ModelLike",
     "Query",
     "RelationConfig",
     "SceneFacts",

@@ -2,7 +2,7 @@
 
 Only pairs in which something moved are evaluated again. What stands on or in a supporter that moves is carried along
 until it is observed itself: T_supporter_child = T_map_supporter^-1 T_map_child is kept from when the child was last
-seen, and T_map_child = T_map_supporter T_supporter_child since then (tracking paper, section III.D, T_m^c = T_m^t T_t^c).
+seen, and T_map_child = T_map_supporter T_supporter_child since then: the tracking paper's T_m^c = T_m^t T_t^c (III.D).
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +14,7 @@ import numpy as np
 from simtrack.contracts import Float64, MapEntity, Relation, Room, StaticMap, Status, Track
 from simtrack.errors import InvalidValueError, UnknownNameError
 from simtrack.geometry.transforms import angle_between, inverse, transform
+from simtrack.objects.semantics import SEMANTIC_CLASSES
 from simtrack.perception.scene_graph import kernels
 from simtrack.perception.scene_graph.facts import Entity, Layer, SceneFacts
 from simtrack.perception.scene_graph.history import History
@@ -59,7 +60,7 @@ class SceneGraph(SceneFacts):
         static_map: entities and rooms; None for a graph of objects alone.
         models: object models by name, as `Track.class_name` gives it.
         config: settings.
-        parents: background taxonomy, semantic class -> direct superclasses (`simtrack.objects.SEMANTIC_CLASSES`).
+        parents: background taxonomy, semantic class -> direct superclasses; None for that of `simtrack.objects`.
     """
 
     def __init__(
@@ -79,7 +80,7 @@ class SceneGraph(SceneFacts):
             rooms=static_map.rooms if static_map else (),
             history=History(),
             config=rules,
-            parents=parents or {},
+            parents=SEMANTIC_CLASSES if parents is None else parents,
             models={name: model.semantic_class for name, model in models.items()},
         )
         self.status = Status.OK
@@ -295,6 +296,8 @@ class SceneGraph(SceneFacts):
         points = self._T[slots, :3, 3]
         margins = np.stack([_room_margins(points, room) for room in rooms], axis=1)
         for row, slot in enumerate(slots.tolist()):
+            if slot in self._static and self._static[slot].room in self.rooms:
+                continue
             current = self._room.get(slot, "")
             best = int(np.argmax(margins[row]))
             stays = [i for i, room in enumerate(rooms) if room.name == current]

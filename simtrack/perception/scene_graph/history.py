@@ -53,21 +53,47 @@ class History:
         return self._frozen
 
     def begin(self, stamp: int, relation: Relation) -> None:
-        """Note that a relation holds from `stamp`, nanoseconds; no effect if it holds already."""
-        if relation not in self._current:
-            self._current.add(relation)
-            self._frozen = None
-            self._intervals.setdefault(relation, []).append(Interval(stamp, None))
+        """Note that a relation holds from `stamp`, nanoseconds; no effect if it holds already.
+
+        One that ended at the same stamp did not end.
+        """
+        if relation in self._current:
+            return
+        self._current.add(relation)
+        self._frozen = None
+        spans = self._intervals.setdefault(relation, [])
+        if spans and spans[-1].end == stamp:
+            spans[-1] = Interval(spans[-1].begin, None)
+            self._forget(Event(stamp, relation, False))
+        else:
+            spans.append(Interval(stamp, None))
             self.events.append(Event(stamp, relation, True))
 
     def end(self, stamp: int, relation: Relation) -> None:
-        """Note that a relation holds no more from `stamp`, nanoseconds; no effect if it does not hold."""
-        if relation in self._current:
-            self._current.remove(relation)
-            self._frozen = None
-            spans = self._intervals[relation]
-            spans[-1] = Interval(spans[-1].begin, stamp)
+        """Note that a relation holds no more from `stamp`, nanoseconds; no effect if it does not hold.
+
+        One that began at the same stamp did not begin.
+        """
+        if relation not in self._current:
+            return
+        self._current.remove(relation)
+        self._frozen = None
+        spans = self._intervals[relation]
+        begin = spans.pop().begin
+        if begin == stamp:
+            self._forget(Event(stamp, relation, True))
+        else:
+            spans.append(Interval(begin, stamp))
             self.events.append(Event(stamp, relation, False))
+        if not spans:
+            del self._intervals[relation]
+
+    def _forget(self, event: Event) -> None:
+        """Strike out an event of the present stamp, one of the last."""
+        for index in range(len(self.events) - 1, -1, -1):
+            if self.events[index] == event:
+                del self.events[index]
+                return
 
     def intervals(self, relation: Relation) -> tuple[Interval, ...]:
         """Intervals during which a relation held, earliest first; empty if it never did."""

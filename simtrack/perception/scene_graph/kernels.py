@@ -122,7 +122,7 @@ def in_margin(world, a, b, strict):
     contained = min(hb[0] - abs(t[0]) - e[0], hb[1] - abs(t[1]) - e[1], hb[2] - abs(t[2]) - e[2])
     half = world.interior_halves[b]
     if half[2] <= 0.0:
-        return contained
+        return -np.inf
     for k in range(3):
         t[k] -= world.interior_centres[b, k]
     below_rim = half[2] - (t[2] - e[2]) - min(0.5 * e[2], half[2])

@@ -68,9 +68,9 @@ class RelationConfig:
     """Metres: margin at which a relation begins to hold."""
     leave_margin: float = 0.002
     """Metres: a relation that holds ends when its margin falls below minus this (hysteresis against flicker)."""
-    container_classes: frozenset[str] = frozenset({"bin", "box", "cabinet", "container", "cupboard", "rack", "shelf"})
+    container_classes: frozenset[str] = frozenset({"bin", "cabinet", "container", "cupboard", "shelf", "trash-bin"})
     """Semantic classes of the static map that are hollow. Tracked models are recognised by their mesh."""
-    layout_classes: frozenset[str] = frozenset({"ceiling", "door", "floor", "wall", "window"})
+    layout_classes: frozenset[str] = frozenset({"ceiling", "door", "door-frame", "floor", "wall", "window"})
     """Semantic classes that carry, touch and are near things, but are no landmarks: no directions, no `in`."""
 
     def __post_init__(self) -> None:

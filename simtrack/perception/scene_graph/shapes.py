@@ -7,6 +7,7 @@ floor of an open container, the step of an L-shaped tool and the flat top of a b
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from heapq import heappop, heappush
 from typing import Protocol
 
 import numpy as np
@@ -21,7 +22,8 @@ _FINE_CELL, _FINE_CELLS = 0.002, 128
 _CONTACT_CELLS = 24
 """Cells per side that take part in contact tests."""
 _BASIN_DEPTH, _BASIN_AREA = 0.3, 0.25
-"""A model is a container if a hollow deeper than this share of its height covers this share of its footprint."""
+"""A model is a container if a hollow deeper than this share of its height covers this share of its footprint; how deep
+a hollow is, its lowest edge tells."""
 _BOX_CELLS = 8
 """Cells per side of the faces of a body that is known by its box alone."""
 
@@ -59,7 +61,7 @@ class Interior:
     centre: Float64
     """(3,), entity frame."""
     extents: Float64
-    """(3,), metres; the lower side is the inner floor, the upper side the rim."""
+    """(3,), metres; the lower side is the inner floor, the upper side the top of the walls."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,13 +149,8 @@ def _coarse(heights: Float64) -> Float64:
 
 
 def _find_interior(highest: Float64, extents: Float64) -> Interior | None:
-    """The hollow that walls enclose on all sides, seen from above; `highest` (U, V) is z over x, y."""
-    from scipy.ndimage import label
-
-    low = highest < 0.5 * extents[2] - _BASIN_DEPTH * extents[2]
-    labels = np.empty((low.shape[0] + 2, low.shape[1] + 2), dtype=np.int32)
-    label(np.pad(low, 1, constant_values=True), output=labels)
-    basin = (low & (labels[1:-1, 1:-1] != labels[0, 0])) & np.isfinite(highest)
+    """Where water would stand if it rained into the body; `highest` (U, V) is z over x, y."""
+    basin = np.isfinite(highest) & (_water_level(highest) > highest + _BASIN_DEPTH * extents[2])
     if basin.mean() < _BASIN_AREA:
         return None
     floor = float(np.median(highest[basin]))
@@ -164,6 +161,25 @@ def _find_interior(highest: Float64, extents: Float64) -> Interior | None:
     rim = 0.5 * float(extents[2])
     centre = np.array([*(0.5 * (lower + upper)), 0.5 * (floor + rim)])
     return Interior(centre, np.array([*(upper - lower), rim - floor]))
+
+
+def _water_level(ground: Float64) -> Float64:
+    """Lowest height over which water drains from each cell of (U, V); it drains at the border and where ground is -inf.
+
+    The priority flood of R. Barnes, C. Lehman, D. Mulla, Computers & Geosciences 62, 2014.
+    """
+    level = np.full((ground.shape[0] + 2, ground.shape[1] + 2), np.nan)
+    level[[0, -1], :] = level[:, [0, -1]] = -np.inf
+    level[1:-1, 1:-1][ground == -np.inf] = -np.inf
+    shores = [(-np.inf, int(i), int(j)) for i, j in np.argwhere(level == -np.inf)]
+    heights = np.pad(ground, 1)
+    while shores:
+        height, i, j = heappop(shores)
+        for p, q in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+            if 0 <= p < level.shape[0] and 0 <= q < level.shape[1] and np.isnan(level[p, q]):
+                level[p, q] = max(height, float(heights[p, q]))
+                heappush(shores, (float(level[p, q]), p, q))
+    return level[1:-1, 1:-1]
 
 
 @njit(cache=True, nogil=True)
