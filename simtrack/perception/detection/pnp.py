@@ -67,8 +67,8 @@ def solve_pose(
         return []
 
     found: list[tuple[float, Float64]] = []
-    for T in _candidates(points, pixels, model, usable, intrinsics):
-        error = _rms(T, points, pixels, intrinsics)
+    for T, matched in _candidates(points, pixels, model, intrinsics):
+        error = _rms(T, matched, pixels, intrinsics)
         depth = T[2, 3]
         if np.isfinite(T).all() and 0.05 < depth < config.max_distance and error <= config.max_error * extent:
             found.append((error, T))
@@ -93,12 +93,13 @@ def project_points(T_camera_object: Float64, points: Float64, intrinsics: Camera
 
 
 def _candidates(
-    points: Float64, pixels: Float64, model: ObjectModel, usable: np.ndarray, intrinsics: CameraIntrinsics
-) -> Iterator[Float64]:
+    points: Float64, pixels: Float64, model: ObjectModel, intrinsics: CameraIntrinsics
+) -> Iterator[tuple[Float64, Float64]]:
+    """Poses (4, 4), each with the object points (N, 3) that it takes the pixels for."""
     T = _pnp(points, pixels, intrinsics)
     if T is None:
         return
-    yield T
+    yield T, points
     # Seen from afar, a box tilted towards the camera looks like one tilted away: start again from the reversed tilt.
     view = T[:3, 3] / np.linalg.norm(T[:3, 3])
     for axis in range(3):
@@ -108,16 +109,23 @@ def _candidates(
             angle = 2.0 * np.arctan2(norm, abs(float(normal @ view)))
             sign = 1.0 if normal @ view > 0 else -1.0
             start = transform(exp_so3(sign * angle * tilt / norm) @ T[:3, :3], T[:3, 3])
-            yield _refine(start, points, pixels, intrinsics)
+            yield _refine(start, points, pixels, intrinsics), points
     # A detector confuses the corners of symmetric objects: give each keypoint the nearest equivalent corner.
     for symmetry in model.symmetries.discrete[1:]:
         alternatives = np.stack([points, points @ symmetry[:3, :3].T + symmetry[:3, 3]])
-        projected = np.stack([project_points(T, p, intrinsics) for p in alternatives])
-        choice = np.argmin(np.linalg.norm(projected - pixels, axis=2), axis=0)
-        if 0 < np.count_nonzero(choice) < len(choice):
-            mixed = alternatives[choice, np.arange(len(points))]
-            if (T_mixed := _pnp(mixed, pixels, intrinsics)) is not None:
-                yield _refine(T_mixed, points, pixels, intrinsics)
+        T_mixed, mixed = T, points
+        for _ in range(3):
+            projected = np.stack([project_points(T_mixed, p, intrinsics) for p in alternatives])
+            distances = np.linalg.norm(projected - pixels, axis=2)
+            mixed = alternatives[np.argmin(distances, axis=0), np.arange(len(points))]
+            if not np.isfinite(distances).all() or len(np.unique(mixed.round(6), axis=0)) < 6:
+                break  # too few different corners left to be a box
+            solution = _pnp(mixed, pixels, intrinsics)
+            if solution is None:
+                break
+            T_mixed = solution
+        else:
+            yield T_mixed, mixed
 
 
 def _pnp(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> Float64 | None:

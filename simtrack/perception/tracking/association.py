@@ -28,7 +28,7 @@ def rotation_apart(T: Float64, T_reference: Float64, model: ObjectModel) -> floa
 @lru_cache(maxsize=1)
 def _grid() -> Float64:
     axis = (np.arange(6) + 0.5) / 6.0 - 0.5
-    return np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    return np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3).astype(np.float64)
 
 
 def box_overlap(T_a: Float64, extents_a: Float64, T_b: Float64, extents_b: Float64) -> float:

@@ -14,7 +14,7 @@ def test_rotation_equals_rodrigues() -> None:
 
 
 def _points(rng: np.random.Generator, count: int = 40):
-    model = rng.uniform(-0.1, 0.1, (count, 3)) + [0, 0, 1.0]
+    model = rng.uniform(-0.1, 0.1, (count, 3)) + np.array([0, 0, 1.0])
     normal = rng.standard_normal((count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     return model + 0.002 * rng.standard_normal((count, 3)), model, normal
@@ -50,7 +50,7 @@ def test_point_gradient_is_that_of_the_cost() -> None:
 def test_silhouette_gradient_is_that_of_the_projection() -> None:
     rng = np.random.default_rng(2)
     count = 30
-    point = rng.uniform(-0.1, 0.1, (count, 3)) + [0, 0, 1.2]
+    point = rng.uniform(-0.1, 0.1, (count, 3)) + np.array([0, 0, 1.2])
     direction = rng.standard_normal((count, 2))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     offset = rng.uniform(-2, 2, count)
