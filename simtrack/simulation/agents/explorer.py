@@ -26,17 +26,21 @@ from simtrack.simulation.agents.gaze import Patch, clipped, head_angles, in_view
 class ExplorerConfig:
     """Settings of `ExplorerAgent`."""
 
-    classes: tuple[str, ...] = ("workbench", "table", "desk", "shelf")
-    """Map entities on which objects are sought."""
+    classes: tuple[str, ...] = ("workbench", "shelf")
+    """Map entities on which objects are sought first."""
+    further_classes: tuple[str, ...] = ("table", "desk", "cart")
+    """Map entities on which objects are sought when nothing has moved for a while."""
+    calm: float = 6.0
+    """How long that is, seconds."""
     dwell: float = 0.9
     """How long a patch has to be in view until it counts as explored, seconds."""
     view_distance: tuple[float, float] = (0.8, 2.1)
     """Distances from which a surface is looked at, metres."""
     reach: float = 2.6
     """Patches further than this from the camera are not seen well enough, metres."""
-    max_linear: float = 0.8
+    max_linear: float = 0.9
     """m/s."""
-    max_angular: float = 0.9
+    max_angular: float = 1.0
     """rad/s."""
     memory: float = 12.0
     """A surface with tracks on it that has not been looked at for this long is looked at again, seconds."""
@@ -61,7 +65,10 @@ class ExplorerAgent:
         self.config = config or ExplorerConfig()
         self._intrinsics = intrinsics
         self._plan = FloorPlan(static_map)
-        self._patches = support_patches(static_map, self.config.classes)
+        self._patches = support_patches(static_map, self.config.classes + self.config.further_classes)
+        first = {e.name for e in static_map.entities if e.semantic_class in self.config.classes}
+        self._first = first or {p.entity for p in self._patches}
+        self._last_motion = 0
         self._posture = start
         self._stamp = -1
         self._goal: _Viewpoint | None = None
@@ -90,6 +97,8 @@ class ExplorerAgent:
                 patch.seen_for += elapsed
                 patch.last_seen = belief.stamp
         for track in belief.tracks:
+            if track.moving:
+                self._last_motion = belief.stamp
             if track.status is TrackStatus.LOST:
                 self._lost_at.setdefault(track.id, belief.stamp)
             else:
@@ -102,10 +111,12 @@ class ExplorerAgent:
     def _choose(self, belief: Belief) -> tuple[str, Float64 | None]:
         """The entity to look at and the point (3,) of the map to point the camera at."""
         unexplored = [p for p in self._patches if p.seen_for < self.config.dwell]
-        reachable = [p for p in unexplored if self._worth(p, belief)]
+        calm = belief.stamp - self._last_motion > self.config.calm * NANOSECONDS
+        reachable = [p for p in unexplored if (calm or p.entity in self._first) and self._worth(p, belief)]
         if reachable:
-            entity = min({p.entity for p in reachable}, key=lambda e: self._cost(e, reachable, belief))
-            return entity, _middle([p for p in reachable if p.entity == entity])
+            entity = min(sorted({p.entity for p in reachable}), key=lambda e: self._cost(e, reachable, belief))
+            patch = min((p for p in reachable if p.entity == entity), key=lambda p: self._turn(p.centre, belief))
+            return entity, patch.centre
         sought = self._search(belief)
         if sought:
             nearest = min(sought, key=lambda p: self._turn(p.centre, belief))
