@@ -101,15 +101,17 @@ def _fixed(name: str) -> Joint:
 def _body() -> list[Link]:
     at = transform_xyz_rpy
     column = _rounded((-0.13, -0.11, 0.28), (0.05, 0.11, 0.72), 0.04)
+    inner = _rounded((-0.055, -0.09, -0.48), (0.095, 0.09, -0.15), 0.03)
     badge = _rounded((0.12, -0.06, -0.02), (0.142, 0.06, 0.05), 0.01)
     return [
-        _link("base", "", None, np.eye(4), _lathe((0.25, 0.09), (0.27, 0.12), (0.27, 0.24), (0.21, 0.3)), 38.5),
+        _link("base", "", None, np.eye(4), _lathe((0.25, 0.09), (0.27, 0.12), (0.27, 0.24), (0.21, 0.3)), 38.0),
         _link("skirt", "base", _fixed("skirt"), np.eye(4), _lathe((0.235, 0.015), (0.245, 0.09)), 2.0, DARK),
         _link("column", "base", _fixed("column"), np.eye(4), column, 8.0, GREY),
         _link(
             "torso", "base", Joint(TORSO, "prismatic", Z, 0.0, 0.35, 0.07), at((-0.062, 0.0, 0.79)),
             _rounded((-0.08, -0.135, -0.20), (0.135, 0.135, 0.11), 0.06), 9.0,
         ),
+        _link("lift_column", "torso", _fixed("lift_column"), np.eye(4), inner, 0.5, DARK),
         _link("badge", "torso", _fixed("badge"), np.eye(4), badge, 0.1, BLUE),
         _link(
             "neck", "torso", Joint(HEAD_PAN, "revolute", Z, -1.24, 1.24, 2.0), at((0.06, 0.0, 0.10)),

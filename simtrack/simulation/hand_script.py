@@ -23,9 +23,9 @@ Motion: TypeAlias = Iterator[HandPose]
 DT = TIMESTEP_NS * 1e-9
 PEAK = 1.875
 """Peak over mean speed of a minimum-jerk motion (Flash and Hogan, 1985)."""
-REACH_SPEED, REACH_RATE = 1.4, 3.0
+REACH_SPEED, REACH_RATE = 1.5, 4.0
 """Peak speed (m/s) and turning rate (rad/s) of the empty hand."""
-GENTLE = 0.3
+GENTLE = 0.4
 """Peak speed near things, m/s."""
 HOVER = 0.14
 """Metres above a thing from which the hand comes down to it."""
@@ -115,9 +115,6 @@ class HandDirector:
             yield self._pose
 
     def _retreat(self) -> Motion:
-        T = self._pose.T_map_hand.copy()
-        T[2, 3] = max(T[2, 3], self._settings.rest[2] - 0.1)
-        yield from self._move(T, 0.06, 0.9)
         yield from self._move(transform(_yawed(self._rest_yaw), self._settings.rest), 0.06, REACH_SPEED)
 
     def _move(self, T: Float64, opening: float, speed: float, rate: float = REACH_RATE) -> Motion:
@@ -151,13 +148,13 @@ class HandDirector:
         T_object = self._object(name)
         height = self._rng.uniform(*action.height)
         top = max(T_grip[2, 3], T_down[2, 3]) + height
-        yield from self._move(_raised(T_grip, top), width, 0.35)
+        yield from self._move(_raised(T_grip, top), width, GENTLE)
         yield from self._transport(_raised(T_down, top), turn, action, width)
         yield from self._put_down(T_down, width, name)
         self._release(name)
         T_down = self._pose.T_map_hand
         yield from self._move(T_down, min(width + 0.03, hand.MAX_OPENING), GENTLE)
-        yield from self._move(_raised(T_down, T_down[2, 3] + HOVER), 0.06, 0.4)
+        yield from self._move(_raised(T_down, T_down[2, 3] + HOVER), 0.06, 2 * GENTLE)
 
     def _put_down(self, T: Float64, opening: float, name: str) -> Motion:
         """Down until the thing touches something, then hold still for a moment."""
@@ -258,8 +255,8 @@ class HandDirector:
         self._touch(True)
         yield from self._move(end, opening, action.speed)
         self._touch(False)
-        yield from self._move(start, opening, 0.2)
-        yield from self._move(_raised(start, start[2, 3] + HOVER), 0.06, 0.4)
+        yield from self._move(start, opening, GENTLE)
+        yield from self._move(_raised(start, start[2, 3] + HOVER), 0.06, 2 * GENTLE)
 
     def _course(self, action: Push, box: Outline) -> tuple[float, float] | None:
         """Heading and distance of a push that ends on the same support, nothing in the way; None if there is none."""

@@ -18,7 +18,7 @@ from simtrack.simulation.building.office_floor import OfficeFloorConfig, office_
 from simtrack.simulation.building.parts import StaticPart, StaticWorld
 from simtrack.simulation.survey import SurveyConfig, survey
 
-FAITHFUL = SurveyConfig(noise=0.0, moved=0.0, brought=0.0, removed=0.0)
+FAITHFUL = SurveyConfig(noise=0.0, edge=1.0, moved=0.0, brought=0.0, removed=0.0)
 SMALL = OfficeFloorConfig(triangles=80_000, area=700.0)
 
 
@@ -29,7 +29,7 @@ def world() -> StaticWorld:
 
 @pytest.fixture(scope="module")
 def static_map(world: StaticWorld) -> StaticMap:
-    return survey(world, None, np.random.default_rng(1))
+    return survey(world, SurveyConfig(edge=0.5), np.random.default_rng(1))
 
 
 @pytest.fixture(scope="module")
