@@ -3,8 +3,8 @@
 Conventions (used everywhere in simtrack)
 -----------------------------------------
 * Transforms are ``T_target_source``, 4x4 float64: ``p_target = T_target_source @ p_source``.
-* Frames: ``map`` (gravity is -z), ``base`` (x forward, y left, z up, origin on the floor), ``camera`` (optical: x right,
-  y down, z forward), ``lidar`` (x forward, z up), ``object`` (origin at the centre of the model's box, z up).
+* Frames: ``map`` (gravity is -z), ``base`` (x forward, y left, z up, origin on the floor), ``camera`` (optical: x
+  right, y down, z forward), ``lidar`` (x forward, z up), ``object`` (origin at the centre of the model's box, z up).
 * Metres, radians, seconds, kilograms; stamps are simulated or recorded time in integer nanoseconds.
 * Images are row 0 on top; pixel centres lie at integer indices. ``depth`` is float32, metres along the optical axis,
   0 = no reading. ``ranges`` are metres along the ray, inf = no return, never NaN.
@@ -48,7 +48,7 @@ class Status(StrEnum):
     """The stage knows that it does not know."""
 
 
-# ---------------------------------------------------------------------------------------------------------------- sensing
+# -------------------------------------------------------------------------------------------------------------- sensing
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +141,7 @@ class JointState:
 SensorFrame: TypeAlias = RgbdFrame | LidarScan | Odometry | JointState
 
 
-# -------------------------------------------------------------------------------------------------------- prior knowledge
+# ------------------------------------------------------------------------------------------------------ prior knowledge
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ class StaticMap:
     """Standard deviation of the surface, metres, as the surveyor states it."""
 
 
-# -------------------------------------------------------------------------------------------------------------- detection
+# ------------------------------------------------------------------------------------------------------------ detection
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +245,7 @@ class Detector(Protocol):
         ...
 
 
-# --------------------------------------------------------------------------------------------------------------- tracking
+# ------------------------------------------------------------------------------------------------------------- tracking
 
 
 class TrackStatus(StrEnum):
@@ -362,7 +362,7 @@ class Tracker(Protocol):
         ...
 
 
-# ----------------------------------------------------------------------------------------------------------- localization
+# --------------------------------------------------------------------------------------------------------- localization
 
 
 @dataclass(frozen=True, slots=True)
@@ -400,7 +400,7 @@ class Localizer(Protocol):
         ...
 
 
-# ------------------------------------------------------------------------------------------------------------ scene graph
+# ---------------------------------------------------------------------------------------------------------- scene graph
 
 
 @dataclass(frozen=True, slots=True)
@@ -436,7 +436,7 @@ class Belief:
     """Stage name -> wall time spent on this frame. Measured, not simulated."""
 
 
-# ----------------------------------------------------------------------------------------------------------------- acting
+# --------------------------------------------------------------------------------------------------------------- acting
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """The one tree of errors that simtrack raises.
 
-Every message says what was wrong, where, and what would have been valid. A stage that merely fails on one frame does not
-raise: it reports a status (see `simtrack.contracts.Status`) and keeps its state.
+Every message says what was wrong, where, and what would have been valid. A stage that merely fails on one frame does
+not raise: it reports a status (see `simtrack.contracts.Status`) and keeps its state.
 """
 
 from collections.abc import Iterable

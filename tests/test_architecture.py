@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,6 +36,14 @@ ROOMS = (
 HIDDEN_FROM_PERCEPTION = {"simulation", "recordings", "datasets", "evaluation", "envs", "report", "cli"}
 HEAVY = {"numba", "scipy", "trimesh", "cv2", "mujoco", "skimage", "shapely", "pyoxigraph", "matplotlib", "embreex"}
 HEAVY |= {"pydantic", "manifold3d", "mcap", "rerun", "tyro", "rich"}
+IMPORT_NAMES = {
+    "opencv-python-headless": "cv2",
+    "scikit-image": "skimage",
+    "pyyaml": "yaml",
+    "rerun-sdk": "rerun",
+    "mcap-ros2-support": "mcap_ros2",
+}
+"""Packages that are imported by another name."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -87,6 +96,18 @@ def test_perception_sees_no_truth(path: Path) -> None:
             if isinstance(identifier, str):
                 found = re.search(r"ground_?truth|(^|_)truth(_|$)|^Truth|Truth$", identifier, re.IGNORECASE)
                 assert not found, f"{path}:{getattr(node, 'lineno', 0)}: the name {identifier}"
+
+
+def test_every_package_that_is_imported_is_a_declared_dependency() -> None:
+    """A machine that has more installed would hide a missing one."""
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    declared = {re.split(r"[\[<>=~!; ]", line)[0] for line in project["dependencies"] + extras["viz"]}
+    modules = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in declared} | {"simtrack", "llvmlite"}
+    for path in MODULES:
+        for line, name in imported(path):
+            top = name.split(".")[0]
+            assert top in modules | set(sys.stdlib_module_names), f"{path}:{line}: {top} is no dependency"
 
 
 def test_the_contracts_need_numpy_only() -> None:

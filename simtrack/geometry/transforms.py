@@ -117,7 +117,7 @@ def perturb(T: Float64, xi: Float64) -> Float64:
 
 
 def difference(T_to: Float64, T_from: Float64) -> Float64:
-    """(6,) perturbation with ``perturb(T_from, difference(T_to, T_from)) == T_to``."""
+    """(6,) perturbation that leads from one transform to the other: ``perturb(T_from, xi) == T_to``."""
     return np.concatenate([T_to[:3, 3] - T_from[:3, 3], log_so3(T_to[:3, :3] @ T_from[:3, :3].T)])
 
 
