@@ -20,12 +20,13 @@ class Assessment:
     explained: float
     """Share of all shots that the map explains."""
     structure: float
-    """Share explained among the shots that no level surface explains: floors and ceilings look alike everywhere."""
+    """Share explained among the shots that no level surface explains: floors and ceilings look alike everywhere. A shot
+    that is explained only if something was taken away counts half."""
     through: float
     """Share, of the same, that reach through surfaces of the map: evidence against the pose, unlike things in front."""
     verdicts: Verdicts
-    """(N,), one a shot: 2 explained, 0 something is in front of the map or the map has nothing there, -1 the shot
-    reaches through the map."""
+    """(N,), one a shot: 2 explained, 1 explained by what lies behind a thing that must have been taken away, 0 a thing
+    is in front of the map or the map has nothing there, -1 the shot reaches through the map."""
 
     @property
     def score(self) -> float:
@@ -43,14 +44,20 @@ def assess(measurement: Measurement, surface: MapSurface, T_map_base: Float64, t
 
     if not len(measurement):
         return UNJUDGED
-    hits = surface.cast(T_map_base, measurement)
+    hits, passed = surface.cast(T_map_base, measurement)
     directions = measurement.directions @ T_map_base[:3, :3].T
     cosines = np.einsum("ij,ij->i", hits.normals, directions)
     kinds = explain(measurement.ranges, measurement.sigmas, hits.distances, hits.normals, cosines, tolerance)
-    level, structure, _, through, _ = np.bincount(kinds, minlength=5)
-    rest = max(len(kinds) - int(level), 1)
     verdicts = np.array([2, 2, 0, -1, 0], np.int8)[kinds]
-    return Assessment((int(level) + int(structure)) / len(kinds), int(structure) / rest, int(through) / rest, verdicts)
+    verdicts[passed & (verdicts == 2)] = 1
+    rest = max(int(np.count_nonzero(kinds != 0)), 1)
+    structure = float(np.maximum(verdicts[kinds != 0], 0).sum()) / (2.0 * rest)
+    return Assessment(
+        float(np.count_nonzero(verdicts == 2)) / len(kinds),
+        structure,
+        int(np.count_nonzero(kinds == 3)) / rest,
+        verdicts,
+    )
 
 
 def lead(a: list[Verdicts], b: list[Verdicts]) -> tuple[float, float]:

@@ -53,6 +53,8 @@ class RegistrationConfig:
     """Every how many-th shot takes part, one entry a ray-casting iteration. Coarse first: the last one decides."""
     inner_iterations: int = 5
     """Gauss-Newton steps on the correspondences of one ray-casting iteration."""
+    step_tolerance: float = 5e-5
+    """m, at the median range: smaller Gauss-Newton steps end the inner iterations."""
     range_sigma: float = 0.008
     """m, along the ray, white."""
     pointing_sigma: float = 0.001
@@ -137,17 +139,19 @@ class RecoveryConfig:
     """m: a correction beyond this (and beyond 5 sigma) contradicts odometry and calls for a search."""
     jump_rotation: float = 0.12
     """rad, likewise."""
-    accept_share: float = 0.55
+    accept_share: float = 0.6
     """Explained share of the structure that a found pose must reach."""
-    accept_lead: float = 0.3
+    accept_lead: float = 0.4
     """(wins - losses) / (wins + losses) over every rival, on the shots that tell them apart, after some travel ..."""
     accept_lead_still: float = 0.6
     """... and before that travel."""
-    min_difference: float = 0.01
+    min_difference: float = 0.02
     """Two poses whose explanations of the scans differ in a smaller share of the shots cannot be told apart."""
     accept_scans: int = 6
     """Scans over which a found pose must lead."""
-    accept_travel: float = 1.0
+    accept_searches: int = 3
+    """Global searches in a row that must find nothing better."""
+    accept_travel: float = 2.0
     """m (a radian of turning counts as half a metre)."""
     search_period: float = 1.0
     """s between two global searches while no pose is believed."""

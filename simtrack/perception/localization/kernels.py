@@ -32,15 +32,13 @@ def deskew_shots(
     count = shots.shape[0]
     origins, turned = np.empty((count, 3)), np.empty((count, 3))
     last = knot_times.shape[0] - 2
-    mount = T_base_lidar[:3, 3].copy()
+    mount, d, R, t = T_base_lidar[:3, 3].copy(), np.empty(3), np.empty((3, 3)), np.empty(3)
     for row in range(count):
         shot = shots[row]
         time = times[shot]
         k = 0
         while k < last and time >= knot_times[k + 1]:
             k += 1
-        R = np.empty((3, 3))
-        t = np.empty(3)
         if last < 0:
             R[:, :] = knots[0, :3, :3]
             t[:] = knots[0, :3, 3]
@@ -50,14 +48,12 @@ def deskew_shots(
                 t[i] = knots[k, i, 3] + share * (knots[k + 1, i, 3] - knots[k, i, 3])
             _turn(share * turns[k, 0], share * turns[k, 1], share * turns[k, 2], knots[k], R)
         for i in range(3):
-            d = 0.0
-            o = t[i]
+            d[i] = 0.0
             for j in range(3):
-                o += R[i, j] * mount[j]
-                for m in range(3):
-                    d += R[i, j] * T_base_lidar[j, m] * directions[shot, m]
-            origins[row, i] = o
-            turned[row, i] = d
+                d[i] += T_base_lidar[i, j] * directions[shot, j]
+        for i in range(3):
+            origins[row, i] = t[i] + R[i, 0] * mount[0] + R[i, 1] * mount[1] + R[i, 2] * mount[2]
+            turned[row, i] = R[i, 0] * d[0] + R[i, 1] * d[1] + R[i, 2] * d[2]
     return origins, turned
 
 
@@ -111,11 +107,10 @@ def correspond(
     points, planes = np.empty((count, 3)), np.empty((count, 4))
     variances, hit_patches = np.empty(count), np.empty(count, np.int64)
     kept, hits = 0, 0
-    R, t = T[:3, :3].copy(), T[:3, 3].copy()
+    R, t, d = T[:3, :3].copy(), T[:3, 3].copy(), np.empty(3)
     for i in range(count):
         if instances[i] != map_instance or not np.isfinite(distances[i]):
             continue
-        d = np.empty(3)
         for a in range(3):
             d[a] = R[a, 0] * directions[i, 0] + R[a, 1] * directions[i, 1] + R[a, 2] * directions[i, 2]
         facing = normals[i, 0] * d[0] + normals[i, 1] * d[1] + normals[i, 2] * d[2]

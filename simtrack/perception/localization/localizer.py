@@ -199,7 +199,8 @@ class MeshLocalizer:
         if self._poor >= c.collapse_scans:
             self._recovering, self._everywhere, self._last_search = True, True, None
             self._hypotheses.items = []
-            self._hypotheses.add(np.stack([found.T_map_base, T]), measurement, self._travel(measurement.stamp))
+            travel = self._travel(measurement.stamp)
+            self._hypotheses.add(np.stack([found.T_map_base, T]), measurement, travel, incumbent=True)
             return self._recover(measurement)
         if poor:
             self._anchor(measurement.stamp, T, P)
@@ -246,7 +247,7 @@ class MeshLocalizer:
             found = search(measurement, self.search_map, self.config.search)
             self._hypotheses.add(found.poses, measurement, travel)
         self._hypotheses.weigh(measurement)
-        winner = self._hypotheses.winner(travel, searches=2 if self._everywhere else 1)
+        winner = self._hypotheses.winner(travel, self._everywhere)
         items = self._hypotheses.items
         if winner is None:
             best = items[0] if items else None

@@ -28,8 +28,10 @@ class Hypothesis:
     """(6, 6)."""
     travel: float
     """m, the odometry's travel when it was born."""
-    searches: int = 1
-    """Searches that came up with it."""
+    streak: int = 0
+    """Searches in a row, up to the last one, that found nothing better."""
+    incumbent: bool = False
+    """It continues what was believed before: kept whatever it scores, and overruled by clear evidence only."""
     settled: bool = False
     """Its last registration converged."""
     prior: float = 0.0
@@ -84,6 +86,7 @@ class HypothesisSet:
         measurement: Measurement,
         travel: float,
         start: tuple[Float64, Float64] | None = None,
+        incumbent: bool = False,
     ) -> None:
         """Refine the poses (K, 4, 4) of a search by registration and take those that are new; others are confirmed.
 
@@ -92,6 +95,7 @@ class HypothesisSet:
             measurement: what was searched with.
             travel: m, the odometry's travel by now.
             start: (4, 4) pose and (6, 6) covariance that were given from outside, to prefer what agrees with them.
+            incumbent: the poses continue what was believed before.
         """
         shots = measurement.thinned(max(1, len(measurement) // 1500) | 1)
         covariance = start_covariance(0.15, 0.05)
@@ -101,15 +105,14 @@ class HypothesisSet:
             found = register(shots, self._surface, pose, covariance, self._config.registration, strides=(1, 1, 1, 1))
             fresh.append((assess(shots, self._surface, found.T_map_base).score, found.T_map_base))
         fresh.sort(key=lambda item: -item[0])
-        confirmed: set[int] = set()
-        for score, pose in fresh:
-            twin = next((h for h in self.items if h.near(pose)), None)
-            if twin is not None:
-                if id(twin) not in confirmed and twin.scores:
-                    twin.searches += 1
-                confirmed.add(id(twin))
-            elif score > fresh[0][0] - 0.4:
-                self.items.append(Hypothesis(pose, covariance.copy(), travel, prior=_agreement(pose, start)))
+        for h in self.items:
+            h.streak = h.streak + 1 if fresh and h.near(fresh[0][1]) else 0
+        for rank, (score, pose) in enumerate(fresh):
+            if score > fresh[0][0] - 0.4 and not any(h.near(pose) for h in self.items):
+                prior = _agreement(pose, start)
+                self.items.append(
+                    Hypothesis(pose, covariance.copy(), travel, int(rank == 0), incumbent=incumbent, prior=prior)
+                )
 
     def weigh(self, measurement: Measurement) -> None:
         """Correct every hypothesis with a measurement, judge it, merge those that met and drop the poor."""
@@ -133,30 +136,39 @@ class HypothesisSet:
             if twin is not None:
                 if len(h.scores) > len(twin.scores):  # the older one brings its history along
                     twin.scores, twin.shares, twin.verdicts, twin.travel = h.scores, h.shares, h.verdicts, h.travel
-                twin.searches = max(twin.searches, h.searches)
-            elif h.score > kept[0].score - 0.35 if kept else True:
+                twin.streak = max(twin.streak, h.streak)
+                twin.incumbent |= h.incumbent
+            elif not kept or h.incumbent or h.score > kept[0].score - 0.35:
                 kept.append(h)
-        self.items = kept[: self._config.recovery.hypotheses]
+        limit = self._config.recovery.hypotheses
+        self.items = [h for k, h in enumerate(kept) if k < limit or h.incumbent]
 
-    def winner(self, travel: float, searches: int) -> Hypothesis | None:
+    def winner(self, travel: float, everywhere: bool) -> Hypothesis | None:
         """The hypothesis that may be believed by now, if any: good in itself, and ahead of all rivals for long enough.
 
-        `travel` is the odometry's travel by now, `searches` how many searches must have come up with it.
+        Args:
+            travel: m, the odometry's travel by now.
+            everywhere: the whole map is being searched, so the place may be one that no search has come up with yet:
+                several searches in a row, with what was measured meanwhile, must find nothing better.
         """
         c = self._config.recovery
         if not self.items:
             return None
         best = self.items[0]
+        if not best.settled or best.share < c.accept_share:
+            return None
+        doubtful = everywhere and not best.incumbent
+        if len(best.scores) < (c.accept_scans if everywhere else 2) or (doubtful and best.streak < c.accept_searches):
+            return None
         moved = travel - best.travel >= c.accept_travel
-        if not best.settled or best.searches < searches or best.share < c.accept_share:
-            return None
-        scans = c.accept_scans if searches > 1 else 2
-        if len(best.scores) < scans:
-            return None
         for rival in self.items[1:]:
+            needed = c.accept_lead if moved else c.accept_lead_still
+            if rival.incumbent:
+                needed = c.accept_lead_still
+            elif best.incumbent or rival.prior < best.prior - 0.1:
+                needed = c.accept_lead
             ahead, differing = lead(list(best.verdicts), list(rival.verdicts))
-            enough = c.accept_lead if moved or rival.prior < best.prior - 0.1 else c.accept_lead_still
-            if ahead < enough or differing < c.min_difference:
+            if ahead < needed or differing < c.min_difference:
                 return None
         return best
 

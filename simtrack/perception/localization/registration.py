@@ -63,6 +63,7 @@ def register(
     T = np.array(T_prior if T_start is None else T_start)
     prior = np.linalg.inv(covariance + 1e-14 * np.eye(6))
     reach = float(np.median(measurement.ranges)) if len(measurement) else 0.0
+    lever = np.array([1.0, 1.0, 1.0, reach, reach, reach])
     gate = _clip_gate(3.0 * _spread(covariance, reach), config)
     upright = floor_information(config)
     strides = config.strides if strides is None else strides
@@ -89,7 +90,7 @@ def register(
             T = perturb(T, step)
             steps += 1
             residual = float(np.sqrt(stats[1] / max(stats[0], 1e-12)))
-            if float(np.abs(step).max()) < 1e-5:
+            if float(np.abs(step * lever).max()) < config.step_tolerance:
                 break
         change = difference(T, T_cast)
         moved = float(np.linalg.norm(change[:3])) + reach * float(np.linalg.norm(change[3:]))
@@ -107,7 +108,7 @@ def _correspondences(
 ) -> tuple[Float64, Float64, Float64, Float64]:
     from simtrack.perception.localization.kernels import correspond
 
-    hits = surface.cast(T, shots)
+    hits, _ = surface.cast(T, shots)
     points, planes, weights, map_weights, _ = correspond(
         T,
         shots.origins,
@@ -168,7 +169,7 @@ def _kernel(T: Float64, points: Float64, planes: Float64, gate: float, config: R
     """m, scale of the Geman-McClure kernel: anneals with the median distance, which outliers hardly touch."""
     from simtrack.perception.localization.kernels import plane_distances
 
-    return float(min(max(3.0 * np.median(plane_distances(T, points, planes)), config.min_kernel), gate))
+    return float(min(max(3.0 * np.median(plane_distances(T, points[::3], planes[::3])), config.min_kernel), gate))
 
 
 def _observed(info: Float64, feigned: Float64, stats: Float64, config: RegistrationConfig) -> _Subspace:

@@ -2,11 +2,17 @@
 
 import numpy as np
 
-from simtrack.contracts import Float32, Float64, Int32, StaticMap
+from simtrack.contracts import Bool, Float32, Float64, Int32, StaticMap
 from simtrack.errors import MeshError
 from simtrack.geometry.transforms import apply
 from simtrack.perception.localization.measurement import Measurement
 from simtrack.raycast import RayHits, RayScene, TriangleMesh
+
+MAX_BACK_FACES = 3
+"""Surfaces in a row that a ray passes from behind."""
+
+PASSED_OVER = 0.15
+"""m: a shot that reaches through a surface is attributed to the next if it ends so close to that."""
 
 
 class MapSurface:
@@ -44,10 +50,44 @@ class MapSurface:
         self.floor = float(np.median([room.floor for room in static_map.rooms])) if static_map.rooms else 0.0
         """m, height of the map's floor."""
 
-    def cast(self, T_map_base: Float64, shots: Measurement) -> RayHits:
-        """What each shot would have met from `T_map_base`."""
-        rotation = T_map_base[:3, :3]
-        return self.scene.cast_rays(apply(T_map_base, shots.origins), shots.directions @ rotation.T)
+    def cast(self, T_map_base: Float64, shots: Measurement) -> tuple[RayHits, Bool]:
+        """What each shot would have met from `T_map_base`.
+
+        That is the first surface that faces the sensor, unless the shot was measured to reach through it and ends at
+        the next one: then the first is something that has been taken away since the survey. Surfaces seen from behind
+        do not count (the sensor would stand in a thing that is gone).
+
+        Returns:
+            The hits, and (N,) True where the first surface was passed over.
+        """
+        origins, directions = apply(T_map_base, shots.origins), shots.directions @ T_map_base[:3, :3].T
+        hits = self._first_facing(origins, directions)
+        passed = np.zeros(len(shots), bool)
+        through = np.flatnonzero(shots.ranges > hits.distances + 2.0 * PASSED_OVER)
+        if len(through):
+            start = hits.distances[through] + 1e-3
+            onward = self._first_facing(origins[through] + start[:, None] * directions[through], directions[through])
+            second = start + onward.distances
+            ends = np.abs(shots.ranges[through] - second) < PASSED_OVER
+            rows = through[ends]
+            passed[rows] = True
+            hits.distances[rows] = second[ends]
+            hits.normals[rows], hits.faces[rows] = onward.normals[ends], onward.faces[ends]
+            hits.instances[rows] = onward.instances[ends]
+        return hits, passed
+
+    def _first_facing(self, origins: Float64, directions: Float64) -> RayHits:
+        hits = self.scene.cast_rays(origins, directions)
+        for _ in range(MAX_BACK_FACES):
+            behind = np.flatnonzero(np.einsum("ij,ij->i", hits.normals, directions) > 0.0)
+            if not len(behind):
+                break
+            passed = hits.distances[behind] + 1e-3
+            onward = self.scene.cast_rays(origins[behind] + passed[:, None] * directions[behind], directions[behind])
+            hits.distances[behind] = passed + onward.distances
+            hits.normals[behind], hits.faces[behind] = onward.normals, onward.faces
+            hits.instances[behind] = onward.instances
+        return hits
 
 
 def surface_patches(vertices: Float32, faces: Int32, normals: Float64, size: float) -> tuple[Int32, int]:

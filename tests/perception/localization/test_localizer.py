@@ -53,10 +53,10 @@ def test_is_a_localizer(lab_localizer) -> None:
 
 def test_tracks_a_curved_drive_within_millimetres(lab_world, lab_localizer, make_drive) -> None:
     rng = np.random.default_rng(1)
-    drive = make_drive(transform_planar(3, 2.5, 0.3), lambda t: (0.4 * np.cos(0.5 * t), np.sin(0.7 * t)), duration=6.5)
+    drive = make_drive(transform_planar(3, 2.5, 0.3), lambda t: (0.4 * np.cos(0.5 * t), np.sin(0.7 * t)), duration=4.5)
     lab_localizer.reset()
     lab_localizer.initialise(0, drive.pose(0.0), SURE)
-    answers = follow(lab_world, lab_localizer, drive, rng, 6.0)
+    answers = follow(lab_world, lab_localizer, drive, rng, 4.0)
     xi = errors(answers)
     assert all(answer.status is Status.OK for answer, _ in answers)
     assert np.sqrt((xi[:, :3] ** 2).sum(1).mean()) < 0.006
@@ -69,7 +69,7 @@ def test_tracks_a_curved_drive_within_millimetres(lab_world, lab_localizer, make
     assert 0.05 < np.mean(nees) / 3 < 2.0  # the map's noise here is white: its assumed correlation is the cautious side
     for answer, _ in answers:
         check_finite(answer)
-    late = [0.35, 2.0, 3.333, 5.97, 6.08]  # between scans, long ago, ahead of the last scan
+    late = [0.35, 2.0, 3.333, 3.97, 4.08]  # between scans, long ago, ahead of the last scan
     for seconds in late:
         answer = lab_localizer.pose_at(round(seconds * NANOSECONDS))
         xi = difference(drive.pose(seconds), answer.T_map_base)
@@ -85,7 +85,7 @@ def test_one_drive_gives_the_same_bytes_twice(lab_world, lab_localizer, make_dri
     for count in (1, threads):
         numba.set_num_threads(count)
         lab_localizer.reset()
-        answers = follow(lab_world, lab_localizer, drive, np.random.default_rng(4), 1.0)
+        answers = follow(lab_world, lab_localizer, drive, np.random.default_rng(4), 0.6)
         runs.append(np.stack([answer.T_map_base for answer, _ in answers]).tobytes())
     numba.set_num_threads(threads)
     assert runs[0] == runs[1]
@@ -99,7 +99,7 @@ def test_recovers_from_a_wrong_start(office_world, office_localizer, make_drive,
     wrong = perturb(drive.pose(0.0), np.array([0.5 * np.cos(heading), 0.5 * np.sin(heading), 0, 0, 0, np.radians(10)]))
     office_localizer.reset()
     office_localizer.initialise(0, wrong)
-    answers = follow(office_world, office_localizer, drive, rng, 2.0)
+    answers = follow(office_world, office_localizer, drive, rng, 1.0)
     xi = errors(answers)[-5:]
     assert answers[-1][0].status is Status.OK
     assert np.linalg.norm(xi[:, :3], axis=1).max() < 0.05
@@ -114,7 +114,7 @@ def test_notices_that_it_was_carried_off_and_finds_itself(office_world, office_l
     before = follow(office_world, office_localizer, still, rng, 0.8)
     assert before[-1][0].status is Status.OK
     drive = make_drive(transform_planar(15.0, 2.5, 2.0), lambda t: (0.3, 0.3), duration=5.0)
-    after = follow(office_world, office_localizer, drive, rng, 3.5, first=1.0)
+    after = follow(office_world, office_localizer, drive, rng, 3.0, first=1.0)
     xi = errors(after)
     far = np.linalg.norm(xi[:, :3], axis=1) > 0.25
     ok = np.array([answer.status is Status.OK for answer, _ in after])
@@ -128,7 +128,7 @@ def test_notices_that_it_was_carried_off_and_finds_itself(office_world, office_l
 def test_two_equal_rooms_are_reported_as_ambiguous(two_rooms_world, make_drive) -> None:
     localizer = MeshLocalizer(two_rooms_world.static_map)
     drive = make_drive(transform_planar(1.8, 1.5, 0.4), lambda t: (0.05, 0.3), duration=2.5)
-    answers = follow(two_rooms_world, localizer, drive, np.random.default_rng(0), 2.0)
+    answers = follow(two_rooms_world, localizer, drive, np.random.default_rng(0), 1.2)
     assert all(answer.status is Status.AMBIGUOUS for answer, _ in answers)
     assert all(np.array_equal(answer.covariance, UNKNOWN) for answer, _ in answers)
     assert len(localizer.hypotheses) >= 2

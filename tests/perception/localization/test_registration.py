@@ -172,3 +172,27 @@ def test_a_broken_map_is_refused() -> None:
 def test_settings_outside_their_domain_are_refused(make) -> None:
     with pytest.raises(InvalidValueError):
         make()
+
+
+def test_furniture_that_was_taken_away_does_not_blind(exact_lab) -> None:
+    """The robot stands where the survey has a cupboard, before one more that is gone too."""
+    from dataclasses import replace
+
+    from simtrack.geometry.meshes import box_mesh
+    from simtrack.geometry.transforms import apply
+
+    survey = exact_lab.static_map
+    vertices, faces = [survey.vertices], [survey.faces]
+    for x in (3.0, 4.2):
+        box = box_mesh(np.array([0.8, 0.8, 2.0]))
+        faces.append(box.faces + sum(len(v) for v in vertices))
+        vertices.append(apply(transform_planar(x, 2.5, 0.0), np.add(box.vertices, (0.0, 0.0, 1.0))).astype(np.float32))
+    crowded = replace(survey, vertices=np.concatenate(vertices), faces=np.concatenate(faces).astype(np.int32))
+    surface, shots = MapSurface(crowded), measure(exact_lab, TRUE)
+    start, covariance = off_by(TRUE, 0.05, 2.0, np.random.default_rng(5))
+    found = register(shots, surface, start, covariance, RegistrationConfig())
+    assert np.linalg.norm(difference(found.T_map_base, TRUE)[:3]) < 2e-3
+    judged = assess(shots, surface, found.T_map_base)
+    assert judged.structure > 0.85
+    assert judged.through < 0.05
+    assert np.count_nonzero(judged.verdicts == 1) > 500
