@@ -358,7 +358,7 @@ class Tracker(Protocol):
         covariance: Float64,
         hypotheses: Sequence[PoseHypothesis] = (),
     ) -> TrackerResult:
-        """Fuse one frame; `covariance` is that of the camera's pose in the map. `hypotheses` may be of an older stamp."""
+        """Fuse one frame; `covariance` is that of the camera's map pose. `hypotheses` may be of an older stamp."""
         ...
 
 
