@@ -20,7 +20,7 @@ def out() -> "Console":
     """Standard output."""
     from rich.console import Console
 
-    return Console(highlight=False, soft_wrap=not _is_terminal())
+    return Console(highlight=False, width=None if _is_terminal() else 120)
 
 
 def _is_terminal() -> bool:
@@ -61,7 +61,7 @@ def show_table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: 
 
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     for k, column in enumerate(columns):
-        table.add_column(column, justify="right" if k in right else "left", overflow="fold")
+        table.add_column(column, justify="right" if k in right else "left", overflow="fold", no_wrap=k in right)
     for row in rows:
         table.add_row(*(cell if isinstance(cell, Text) else Text(str(cell)) for cell in row))
     out().print(table)

@@ -88,4 +88,7 @@ def _summarise(record: "RunRecord") -> None:
     rows = [
         (row.name, row.value, row.asked, marks[row.verdict], row.floor) for row in table(record.metrics, names, targets)
     ]
-    console.show_table(("metric", "value", "asked", "", "noise floor"), rows, right=(1, 2, 4))
+    columns = ("metric", "value", "asked", "", "noise floor")
+    if console.out().width < 90:
+        columns, rows = columns[:4], [row[:4] for row in rows]
+    console.show_table(columns, rows, right=(1, 2, 4))

@@ -197,8 +197,8 @@ class ClosedLoopRun:
     _stages: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     _timeline: RelationTimeline = field(default_factory=RelationTimeline)
     _images: int = 0
-    _steady_from: tuple[int, float] | None = None
-    """Images and seconds of the loop at the end of the warm-up."""
+    _steady_from: tuple[int, float, float] | None = None
+    """Images, seconds of the loop and of the evaluation at the end of the warm-up."""
     _partial: bool = True
     _gain: Metric = field(default_factory=lambda: unmeasured("1", "the fixed gaze was not run for comparison"))
 
@@ -248,7 +248,7 @@ class ClosedLoopRun:
             if isinstance(frame, RgbdFrame):
                 self._images += 1
                 if self._steady_from is None and frame.stamp >= WARM_UP:
-                    self._steady_from = self._images, self._clock.loop
+                    self._steady_from = self._images, self._clock.loop, self._clock.total["evaluation"]
             yield frame, belief
             for observer in self.observers:
                 observer.frame(frame, belief)
@@ -311,16 +311,15 @@ class ClosedLoopRun:
         }
 
     def _speed(self) -> Metrics:
-        images, seconds = self._steady_from or (0, 0.0)
-        spent = self._clock.loop - seconds
+        images, seconds, evaluated = self._steady_from or (0, 0.0, 0.0)
+        spent, apart = self._clock.loop - seconds, self._clock.total["evaluation"] - evaluated
         missing = "the run was too short"
         rate = ratio(self._images - images, spent, missing) if self._images > images else unmeasured("Hz", missing)
         metrics: Metrics = {"speed.frames_per_second": Metric(rate.value, "Hz", rate.reason)}
         stages = self.stage_seconds()
         for stage in sorted(stages):
             metrics[f"speed.stage.{stage}.median"] = quantile(stages[stage], 0.5, "s", missing)
-        everything = sum(self._clock.total.values())
-        metrics["speed.evaluation_share"] = ratio(self._clock.total["evaluation"], everything, missing)
+        metrics["speed.evaluation_share"] = ratio(apart, spent + apart, missing)
         metrics["speed.peak_memory"] = peak_memory()
         return metrics
 

@@ -90,9 +90,7 @@ def floor_plan(record: RunRecord, colors: Mapping[str, str]) -> str:
             if thing.track is not None:
                 x, y = thing.track.T_map_object[:2, 3]
                 axes.plot(x, y, marker="o", markersize=4.5, color=colors[thing.class_name], markeredgecolor=FACE)
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(low[1], high[1])
-        axes.set_aspect("equal", adjustable="datalim")
+        _show(axes, low, high, figure)
         axes.set_xlabel("x in m")
         axes.set_ylabel("y in m")
         axes.grid(True)
@@ -123,6 +121,17 @@ def _footprint(axes: "Axes", entity: MapEntity, names: bool) -> None:
             clip_on=True,
             annotation_clip=True,
         )
+
+
+def _show(axes: "Axes", low: Float64, high: Float64, figure: "Figure") -> None:
+    """Show at least this part of the plan, and as much around it as fills the figure."""
+    width, height = figure.get_size_inches() - (0.7, 0.9)  # without labels and legend
+    size = high - low
+    wanted = np.maximum(size, [size[1] * width / height, size[0] * height / width])
+    middle = (low + high) / 2
+    axes.set_xlim(middle[0] - wanted[0] / 2, middle[0] + wanted[0] / 2)
+    axes.set_ylim(middle[1] - wanted[1] / 2, middle[1] + wanted[1] / 2)
+    axes.set_aspect("equal", adjustable="box")
 
 
 def _extent(points: Sequence[Float64], margin: float = 1.6, least: float = 5.0) -> tuple[Float64, Float64]:
@@ -203,6 +212,7 @@ def _object_row(axes: "Axes", record: RunRecord, name: str, frames: Sequence[Obj
 def lidar_view(record: RunRecord, picture: LidarPicture) -> str:
     """A scan from above: red is what nothing explains."""
     close = np.abs(picture.points[:, :2] - picture.T_map_base[:2, 3]).max(axis=1) < 12.0
+    shown = picture.points[close, :2] if close.any() else np.array([[-1.0, -1.0], [1.0, 1.0]])
     known, unknown = (picture.points[close & flags] for flags in (~picture.unknown, picture.unknown))
 
     def draw(figure: "Figure", width: float) -> None:
@@ -213,7 +223,7 @@ def lidar_view(record: RunRecord, picture: LidarPicture) -> str:
         forward = picture.T_map_base[:2, 0] * 0.5
         axes.annotate("", (x + forward[0], y + forward[1]), (x, y), arrowprops={"arrowstyle": "-|>", "color": ACCENT})
         axes.plot(x, y, marker="o", color=ACCENT, markersize=6)
-        axes.set_aspect("equal", adjustable="datalim")
+        _show(axes, shown.min(axis=0), shown.max(axis=0), figure)
         axes.set_xlabel("x in m")
         axes.set_ylabel("y in m")
 

@@ -1,0 +1,118 @@
+"""Runs from the command line: what lies in their folder, that they repeat, that a stop keeps what was measured."""
+
+import csv
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from simtrack.evaluation.metrics import read_metrics
+
+ROOT = Path(__file__).parents[2]
+SECONDS = 1.2
+ASKED_FOR = """
+localization.ate_rmse localization.rotation_rmse
+tracking.static.translation_error.median tracking.static.translation_error.p95
+tracking.moving.translation_error.median tracking.moving.translation_error.p95
+tracking.rotation_error.median tracking.floor_ratio tracking.map.translation_error.median
+tracking.add_s_auc tracking.recall tracking.false_tracks tracking.id_switches tracking.reacquisition_time.p95
+world.known_share loop.gaze_gain
+presegmentation.camera.known_rejected presegmentation.camera.unknown_recall presegmentation.camera.reduction
+presegmentation.lidar.known_rejected presegmentation.lidar.unknown_recall presegmentation.lidar.reduction
+presegmentation.objects_found relations.f1 relations.f1.on relations.f1.left-of
+speed.frames_per_second speed.stage.tracking.median speed.peak_memory
+""".split()  # noqa: SIM905
+
+pytestmark = pytest.mark.slow
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100", "NO_COLOR": "1"}
+    command = [sys.executable, "-m", "simtrack", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def command(*arguments: object) -> str:
+    process = start(*arguments)
+    stdout, stderr = process.communicate(timeout=600)
+    assert process.returncode == 0, stdout + stderr
+    return stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A short run with a log of its feed beside it."""
+    path = tmp_path_factory.mktemp("runs") / "first"
+    log = path.with_suffix(".mcap")
+    command("run", "--duration", SECONDS, "--renderer", "embree", "--out", path, "--log", log)
+    return path
+
+
+def test_folder_is_complete(folder: Path) -> None:
+    names = {path.name for path in folder.iterdir()}
+    assert names == {
+        "config.yaml", "estimates.csv", "tracks.csv", "trajectory.csv", "poses.csv", "simtrack_workbench-test.csv",
+        "graph.json", "metrics.json", "report.html",
+    }  # fmt: skip
+    with (folder / "trajectory.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == math.floor(SECONDS * 30)
+    report = (folder / "report.html").read_text()
+    assert "workbench" in report
+    assert "Partial" not in report
+
+
+def test_metrics_have_values_or_reasons(folder: Path) -> None:
+    json.loads((folder / "metrics.json").read_text(), parse_constant=lambda name: pytest.fail(f"{name} in the metrics"))
+    metrics = read_metrics(folder / "metrics.json")
+    assert set(ASKED_FOR) <= set(metrics)
+    assert all(metric.unit for metric in metrics.values())
+    assert all(metric.reason for metric in metrics.values() if metric.value is None)
+    assert metrics["run.partial"].value is False
+    assert metrics["localization.ate_rmse"].value is not None
+    assert metrics["loop.gaze_gain"].value is None
+
+
+def test_graph_answers_queries(folder: Path) -> None:
+    assert "workbench" in command("query", folder, "on workbench")
+    assert "relation" in command("query", folder, "? left-of multimeter")
+
+
+def test_replay_of_the_log_repeats_the_estimates(folder: Path, tmp_path: Path) -> None:
+    command("replay", folder.with_suffix(".mcap"), "--out", tmp_path / "replay")
+    for name in ("estimates.csv", "tracks.csv"):
+        assert (tmp_path / "replay" / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+def test_same_seed_gives_the_same_with_one_thread_and_two(folder: Path, tmp_path: Path) -> None:
+    command("run", "--duration", SECONDS, "--renderer", "embree", "--out", tmp_path / "again", "--threads", 1)
+    first, again = (read_metrics(path / "metrics.json") for path in (folder, tmp_path / "again"))
+    assert set(first) == set(again)
+    assert {n: m for n, m in first.items() if again[n] != m and not n.startswith("speed.")} == {}
+    for name in ("estimates.csv", "tracks.csv", "trajectory.csv", "poses.csv", "simtrack_workbench-test.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+def test_a_stop_keeps_what_was_measured(tmp_path: Path) -> None:
+    path = tmp_path / "stopped"
+    process = start("run", "--duration", 600, "--renderer", "embree", "--out", path)
+    for _ in range(3000):
+        file = path / "trajectory.csv"
+        if file.is_file() and len(file.read_bytes().splitlines()) > 5:
+            break
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130, stderr
+    assert "partial" in stderr
+    metrics = read_metrics(path / "metrics.json")
+    assert metrics["run.partial"].value is True
+    assert metrics["localization.ate_rmse"].value is not None
+    assert "Partial" in (path / "report.html").read_text()
