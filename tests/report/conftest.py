@@ -148,7 +148,7 @@ def record() -> RunRecord:
         start=0, end=(frames - 1) * period, partial=True, metrics=metrics(),
         stamps=[k * period for k in range(frames)], estimated=believed, true=true, object_frames=objects,
         switches=[(30 * period, "multimeter")],
-        stage_seconds={"tracking": rng.gamma(9, 0.002, 60), "localization": rng.gamma(9, 0.001, 60)},
+        stage_seconds={n: rng.gamma(9, s, 60).tolist() for n, s in (("tracking", 0.002), ("localization", 0.001))},
         key_frames=album.key_frames, worst=album.worst, query_frame=album.query_frame, camera=album.camera,
         lidar=album.lidar, believed_relations=timeline.intervals(),
     )  # fmt: skip
