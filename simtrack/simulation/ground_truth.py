@@ -269,12 +269,18 @@ class _ContactLog:
         self._keys: list[int] = []
         self._sets: list[tuple[np.ndarray, np.ndarray]] = []
         self._count = 0
+        self._last = b""
 
     def append(self, data: "mujoco.MjData") -> None:
         contact = data.contact
-        pairs = self._owner[contact.geom]
-        up = contact.frame[:, 2]
-        real = (pairs >= 0).all(axis=1) & (contact.dist <= 0.0) & (pairs[:, 0] != pairs[:, 1])
+        stamp, self._count = self._count * KEY_NS, self._count + 1
+        geoms, apart, up = contact.geom, contact.dist > 0.0, contact.frame[:, 2]
+        fingerprint = geoms.tobytes() + apart.tobytes() + (np.abs(up) > SUPPORTING).tobytes()
+        if fingerprint == self._last:  # mostly so: things rest
+            return
+        self._last = fingerprint
+        pairs = self._owner[geoms]
+        real = (pairs >= 0).all(axis=1) & ~apart & (pairs[:, 0] != pairs[:, 1])
         first, second, up = pairs[real, 0], pairs[real, 1], up[real]
         real = self._is_object[first] | self._is_object[second]
         first, second, up = first[real], second[real], up[real]
@@ -284,7 +290,6 @@ class _ContactLog:
         stands = (np.abs(up) > SUPPORTING) & self._is_object[above]
         supports = np.unique((above * base + below)[stands])
         touches = np.unique(np.minimum(first, second) * base + np.maximum(first, second))
-        stamp, self._count = self._count * KEY_NS, self._count + 1
         last = self._sets[-1] if self._sets else None
         if last is None or not (np.array_equal(last[0], supports) and np.array_equal(last[1], touches)):
             self._keys.append(stamp)

@@ -87,8 +87,10 @@ class HandDirector:
 
     def step(self, data: "mujoco.MjData") -> None:
         """Move the hand on by one physics step."""
-        self._pose = next(self._motion)
-        self._apply(data)
+        pose = next(self._motion)
+        if pose is not self._pose:
+            self._pose = pose
+            self._apply(data)
 
     def _apply(self, data: "mujoco.MjData") -> None:
         T = self._pose.T_map_hand
