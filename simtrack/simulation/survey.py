@@ -22,6 +22,7 @@ from simtrack.geometry.meshes import (
     transformed,
 )
 from simtrack.geometry.transforms import apply, exp_so3, inverse, transform
+from simtrack.simulation.building.cache import cached_map, world_digest
 from simtrack.simulation.building.parts import StaticPart, StaticWorld
 from simtrack.simulation.retessellation import retessellated
 
@@ -91,10 +92,16 @@ def survey(world: StaticWorld, config: SurveyConfig | None = None, rng: np.rando
 
     Returns:
         The mesh with an entity for every part that was surveyed, at its surveyed place. No vertex is shared with the
-        world (unless `noise` is 0, where outlines coincide).
+        world (unless `noise` is 0, where outlines coincide). Kept in the user's cache folder, by content.
     """
     config = SurveyConfig() if config is None else config
     rng = np.random.default_rng(0) if rng is None else rng
+    seed = int(rng.integers(2**63))
+    key = world_digest(world, seed, config)
+    return cached_map(key, lambda: _surveyed(world, config, np.random.default_rng(seed)))
+
+
+def _surveyed(world: StaticWorld, config: SurveyConfig, rng: np.random.Generator) -> StaticMap:
     parts = as_surveyed(world, config, rng)
     edge = config.edge if config.edge is not None else _edge_for(parts, config.max_faces)
     meshes = [_scanned(part, edge, rng) for part in parts]
@@ -240,7 +247,8 @@ def _displaced(mesh: Mesh, config: SurveyConfig, rng: np.random.Generator) -> Me
     waves = rng.normal(0.0, 1.0 / config.correlation, (96, 3))
     phases = rng.uniform(0.0, 2.0 * np.pi, (96,))
     amplitudes = rng.normal(0.0, 1.0, (96, 3))
-    field = np.cos(mesh.vertices @ waves.T + phases) @ amplitudes
+    blocks = np.array_split(mesh.vertices, max(1, len(mesh.vertices) // 4096))
+    field = np.concatenate([np.cos(block @ waves.T + phases) @ amplitudes for block in blocks])
     _, faces = sample_surface(mesh, 20_000, rng)
     weights = rng.dirichlet(np.ones(3), len(faces))
     along = np.einsum("nk,nkd,nd->n", weights, field[mesh.faces[faces]], face_normals(mesh)[faces])
@@ -254,10 +262,12 @@ def _simplified(mesh: Mesh, part: StaticPart) -> Mesh:
 
 def _entity(part: StaticPart, mesh: Mesh) -> MapEntity:
     """The part as the surveyed mesh shows it: box and support faces measured there."""
-    local = transformed(mesh, inverse(part.T_map_part))
+    local = Mesh(apply(inverse(part.T_map_part), mesh.vertices), mesh.faces)
     low, high = local.bounds
-    normals, middle = face_normals(local), local.triangles.mean(axis=1)
     supports = []
+    normals, middle = (
+        (face_normals(local), local.triangles.mean(axis=1)) if part.supports else (np.empty(0), np.empty(0))
+    )
     for T_part_face, size in part.supports:
         flat = apply(inverse(T_part_face), middle)
         near = (

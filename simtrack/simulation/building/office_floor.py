@@ -9,6 +9,7 @@ from simtrack.contracts import Float64, Room
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.meshes import Mesh
 from simtrack.simulation.building import fixtures
+from simtrack.simulation.building.cache import cached_world, digest
 from simtrack.simulation.building.furnishing import Furnisher, room_kind
 from simtrack.simulation.building.layout import PARTITION, Door, Layout, draw_layout
 from simtrack.simulation.building.parts import StaticPart, StaticWorld, polygon_area
@@ -43,8 +44,15 @@ def office_floor(rng: np.random.Generator, config: OfficeFloorConfig | None = No
 
     The map's origin is the south-west corner. Every room can be reached through open doors at least 0.98 m wide, and
     the furniture leaves ways at least 0.72 m wide between all doors of a room.
+
+    Floors are kept in the user's cache folder, by seed, configuration and version of the code.
     """
     config = OfficeFloorConfig() if config is None else config
+    seed = int(rng.integers(2**63))
+    return cached_world(digest(seed, config), lambda: _built(np.random.default_rng(seed), config))
+
+
+def _built(rng: np.random.Generator, config: OfficeFloorConfig) -> StaticWorld:
     width = np.sqrt(config.area * GROSS) * rng.uniform(0.9, 1.12)
     layout = draw_layout(rng, width, config.area * GROSS / width)
     rooms = _rooms(layout, rng)
