@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Float32, Float64, PoseHypothesis
-from simtrack.geometry.transforms import exp_so3
+from simtrack.geometry.transforms import angle_between, exp_so3
 from simtrack.perception.tracking.registration import (
     Registration,
     RegistrationConfig,
@@ -25,8 +25,12 @@ class FitConfig:
 
     support: float = 0.8
     """Least share of its unoccluded rays that must confirm it."""
-    pixels: int = 60
+    pixels: int = 150
     """Fewest pixels that must confirm it."""
+    occluded: float = 0.45
+    """Largest share of its rays on which something may stand in front of it."""
+    turn: float = np.deg2rad(35.0)
+    """Registration may turn a hypothesis by at most this, radians: else it has slid into another minimum."""
     residual: float = 0.0045
     """Largest RMS residual along the normal, metres, at 1 m distance; grows with its square."""
     constrained: int = 4
@@ -57,6 +61,7 @@ def believable(result: RegistrationResult, config: FitConfig) -> bool:
         and result.supported * result.stride**2 >= config.pixels
         and result.residual <= config.residual * max(1.0, z) ** 2
         and result.constrained >= config.constrained
+        and result.occluded <= config.occluded * result.rays
     )
 
 
@@ -92,7 +97,10 @@ class Prober:
         if result is None or not self._good(result):
             turned = [_turned(starts[0], axis, sign * self._fit.retry_angle) for axis in range(3) for sign in (1, -1)]
             result = min((r for r in (result, self._best_of(turned, depth, intrinsics)) if r), key=cost, default=None)
-        return result if result is not None and believable(result, self._fit) else None
+        if result is None or not believable(result, self._fit):
+            return None
+        turned = min(angle_between(result.T_camera_object[:3, :3], h.T_camera_object[:3, :3]) for h in hypotheses)
+        return result if turned <= self._fit.turn else None
 
     def _good(self, result: RegistrationResult) -> bool:
         return result.support >= self._fit.good_support and result.misfit <= self._fit.good_misfit

@@ -105,6 +105,8 @@ class _Target:
     missing_since: int | None = None
     disagreements: int = 0
     moved_when_seen: bool = False
+    known: bool = False
+    """It was believed once: its identity is kept for when it turns up again."""
     score: float = 0.5
     visible_fraction: float = 0.0
     residual: float = 0.0
@@ -231,7 +233,7 @@ class ObjectTracker:
         target.score = min(0.99, target.score + 0.05)
         enough = target.detections >= self.config.confirm_detections and target.frames >= self.config.confirm_frames
         if enough or target.status is not TrackStatus.TENTATIVE:
-            target.status = TrackStatus.CONFIRMED
+            target.status, target.known = TrackStatus.CONFIRMED, True
 
     def _measurement(self, view: _View, result: RegistrationResult, last_seen: int) -> Measurement:
         """A registration in the map frame; the camera's own error wanders, correlated over time."""
@@ -245,7 +247,7 @@ class ObjectTracker:
 
     def _lose(self, target: _Target) -> None:
         """Take a target out of the scene; its identity is kept for when the object turns up again."""
-        if target.status is TrackStatus.TENTATIVE:
+        if not target.known:
             self._targets.remove(target)
         target.status = TrackStatus.LOST
         target.visible_fraction = 0.0
@@ -284,12 +286,12 @@ class ObjectTracker:
 
     def _confirm(self, target: _Target, T_camera_object: Float64, group: list[PoseHypothesis], view: _View) -> None:
         """Take a detection of a tracked object: fuse it, or let it contest an orientation that it disagrees with."""
-        target.detections += 1
-        target.score = min(0.99, target.score + 0.1)
         apart = [rotation_apart(h.T_camera_object, T_camera_object, target.model) for h in group]
         nearest = group[int(np.argmin(apart))]
         if min(apart) <= self.config.disagreement:
             target.disagreements = 0
+            target.detections += 1
+            target.score = min(0.99, target.score + 0.1)
             self._fuse_late(target, T_camera_object, nearest, view)
             return
         target.disagreements += 1
@@ -313,8 +315,9 @@ class ObjectTracker:
         if challenger is None:
             return
         holder = self._prober.judge(T_camera_object, model, view.depth, view.intrinsics)
-        if holder is not None and cost(holder) < 1.3 * cost(challenger):
-            target.disagreements = 0
+        # The more often detections have contradicted a pose, the better it has to fit to stay.
+        margin = 1.3 / max(1.0, 0.5 * target.disagreements)
+        if holder is not None and cost(holder) < margin * cost(challenger):
             return
         state = self._follow_up(target.model, challenger, view)
         if state is not None:
@@ -364,7 +367,7 @@ class ObjectTracker:
         """The target that a reappearing object is: a lost one, or one that was being moved when last seen."""
         lost = [t for t in self._targets if not t.alive and t.model is model]
         if lost:
-            return self._revive(max(lost, key=lambda t: t.last_seen))
+            return self._revive(max(lost, key=lambda t: t.last_seen), followed.state.stamp)
         for target in self._targets:
             unseen = target.status in (TrackStatus.OCCLUDED, TrackStatus.OUT_OF_VIEW)
             age = (followed.state.stamp - target.last_seen) / NANOSECONDS
@@ -373,13 +376,13 @@ class ObjectTracker:
             distance = np.linalg.norm(followed.state.T_map_object[:3, 3] - target.filter.state.T_map_object[:3, 3])
             if age < self.config.same_object_memory and distance < 0.15 + self.config.same_object_speed * age:
                 self._registration.remove(target.id)
-                return self._revive(target)
+                return self._revive(target, followed.state.stamp)
         return None
 
     @staticmethod
-    def _revive(target: _Target) -> _Target:
-        target.status = TrackStatus.CONFIRMED
-        target.score = max(target.score, 0.6)
+    def _revive(target: _Target, stamp: int) -> _Target:
+        """A known object has turned up again: it keeps its identity and is believed after another detection."""
+        target.status, target.born, target.detections, target.frames = TrackStatus.TENTATIVE, stamp, 1, 0
         return target
 
     def _follow_up(self, model: ObjectModel, result: RegistrationResult, view: _View) -> PoseFilter | None:
