@@ -18,7 +18,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Message, MessageIndex, Schema
+from mcap.records import Attachment, Channel, Chunk, Message, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from simtrack.errors import FileFormatError
@@ -117,7 +117,7 @@ class Container:
             if length > size - offset:
                 break
             if opcode == Opcode.MESSAGE_INDEX:
-                indexed.add(self._parse(MessageIndex.read, self._body(stream, offset, length), "index").channel_id)
+                indexed.add(self._parse(ReadDataStream.read2, self._body(stream, offset, min(length, 2)), "index"))
             elif chunk is not None:
                 self.chunks.append(ChunkPosition(*chunk, frozenset(indexed) if indexed else None))
                 chunk, indexed = None, set()
@@ -127,6 +127,8 @@ class Container:
                 # Data follow the name in the record: its head is enough to find it again.
                 head = self._body(stream, offset, min(length, 65_536))
                 self.attachments[self._parse(_attachment_name, head, "attachment")] = (offset, length)
+            elif opcode == Opcode.MESSAGE:
+                raise FileFormatError(self.path, f"message at byte {offset}", "outside a chunk; write with chunks")
             elif opcode == Opcode.FOOTER:
                 stream.seek(offset + length)
                 self.complete = stream.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
@@ -169,7 +171,7 @@ class Container:
         try:
             return parse(ReadDataStream(io.BytesIO(body)))
         except (McapError, struct.error, ValueError, OverflowError) as error:
-            raise FileFormatError(self.path, where, f"damaged or not MCAP: {error or type(error).__name__}") from error
+            raise FileFormatError(self.path, where, f"damaged: {str(error) or type(error).__name__}") from error
 
 
 def _attachment_name(stream: ReadDataStream) -> str:

@@ -72,6 +72,8 @@ STATIC_MAP = "static_map.npz"
 MODELS = "models.npz"
 ROBOT = "robot.npz"
 METADATA = "metadata.json"
+MEDIA_TYPES = {".npz": "application/zip", ".json": "application/json"}
+"""Suffix of an attachment's name -> its media type."""
 
 TRANSIENT_LOCAL = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"

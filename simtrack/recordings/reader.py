@@ -128,15 +128,6 @@ def open_recording(path: str | Path) -> Recording:
         warnings.warn(
             f"{path} was not finished by its writer; what lies before the cut is used", RecordingWarning, stacklevel=2
         )
-    data = container.attachment(layout.METADATA)
-    if data is None:
-        raise FileFormatError(path, f"attachment {layout.METADATA}", "missing: not a recording of simtrack")
-    try:
-        metadata = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(path, f"attachment {layout.METADATA}", f"not JSON: {error}") from error
-    if not isinstance(metadata, dict):
-        raise FileFormatError(path, f"attachment {layout.METADATA}", "not a JSON object")
     static_map: StaticMap | None = _attached(container, layout.STATIC_MAP, StaticMap)
     if static_map is not None:
         _check_map(static_map, path)
@@ -145,7 +136,7 @@ def open_recording(path: str | Path) -> Recording:
         static_map=static_map,
         models=_attached(container, layout.MODELS, dict[str, ObjectModel]) or {},
         robot=_attached(container, layout.ROBOT, KinematicTree),
-        metadata=metadata,
+        metadata=_metadata(container),
         complete=container.complete,
         _container=container,
     )
@@ -162,9 +153,9 @@ def strip_labels(source: str | Path, target: str | Path, *, overwrite: bool = Fa
             if name.startswith(layout.LABEL_KEY):
                 continue
             if name == layout.METADATA:
-                kept = {key: value for key, value in json.loads(data).items() if key != layout.LABEL_KEY}
+                kept = {key: value for key, value in _metadata(container).items() if key != layout.LABEL_KEY}
                 data = json.dumps(kept).encode()
-            media_type = "application/json" if name.endswith(".json") else "application/zip"
+            media_type = layout.MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
             writer.add_attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
         schemas: dict[int, int] = {}
         channels: dict[int, int] = {}
@@ -186,6 +177,20 @@ def _copy(entry: LogMessage, writer: Writer, schemas: dict[int, int], channels: 
     writer.add_message(
         channels[channel.id], message.log_time, message.data, message.publish_time, sequence=message.sequence
     )
+
+
+def _metadata(container: Container) -> dict[str, Any]:
+    where = f"attachment {layout.METADATA}"
+    data = container.attachment(layout.METADATA)
+    if data is None:
+        raise FileFormatError(container.path, where, "missing: not a recording of simtrack")
+    try:
+        metadata = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(container.path, where, f"not JSON: {error}") from error
+    if not isinstance(metadata, dict):
+        raise FileFormatError(container.path, where, "not a JSON object")
+    return metadata
 
 
 def _attached(container: Container, name: str, kind: Any) -> Any:

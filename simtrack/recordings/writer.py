@@ -60,20 +60,17 @@ class McapWriter:
         unless `overwrite`.
         """
         self.path = Path(path)
-        metadata_bytes = json.dumps(dict(metadata or {})).encode()
+        resources = ((layout.STATIC_MAP, static_map), (layout.MODELS, models), (layout.ROBOT, robot))
+        attachments = {layout.METADATA: json.dumps(dict(metadata or {})).encode()}
+        attachments |= {name: archive.encode(value) for name, value in resources if value is not None}
         self._stream = create_file(path, overwrite)
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile=Profile.ROS2, library="simtrack")
         self._clock = -1
         self._T_base_lidar = np.zeros((4, 4))  # of no sensor: the first scan tells
-        self._attach(layout.METADATA, "application/json", metadata_bytes)
-        for name, value in ((layout.STATIC_MAP, static_map), (layout.MODELS, models), (layout.ROBOT, robot)):
-            if value is not None:
-                self._attach(name, "application/zip", archive.encode(value))
+        for name, data in attachments.items():
+            self._writer.add_attachment(0, 0, name, layout.MEDIA_TYPES[Path(name).suffix], data)
         self._channels = self._register()
-
-    def _attach(self, name: str, media_type: str, data: bytes) -> None:
-        self._writer.add_attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
 
     def _register(self) -> dict[str, int]:
         schemas: dict[str, int] = {}

@@ -323,6 +323,25 @@ def test_a_compression_that_is_not_known_is_named(tmp_path: Path) -> None:
         read_all(path)
 
 
+def test_a_log_without_chunks_is_refused(tmp_path: Path) -> None:
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        flat = Writer(stream, use_chunking=False)
+        flat.start()
+        flat.add_message(flat.register_channel("/a", "cdr", 0), 0, b"", 0)
+        flat.finish()
+    with pytest.raises(FileFormatError, match="outside a chunk"):
+        open_recording(tmp_path / "a.mcap")
+
+
+def test_broken_metadata_are_named(forged: Forged, tmp_path: Path) -> None:
+    for content in (b"{", b"[1]", b"\xff"):
+        forged.attach(layout.METADATA, content)
+    path = forged.close()
+    for attempt in (lambda: open_recording(path), lambda: strip_labels(path, tmp_path / "out.mcap", overwrite=True)):
+        with pytest.raises(FileFormatError, match=r"metadata\.json: not"):
+            attempt()
+
+
 def test_stripping_a_cut_log_keeps_what_is_there(whole: Log, tmp_path: Path) -> None:
     cut = write(tmp_path / "cut.mcap", whole.data[: len(whole.data) // 2])
     strip_labels(cut, tmp_path / "out.mcap")
