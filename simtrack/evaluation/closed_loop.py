@@ -243,7 +243,7 @@ class ClosedLoopRun:
         self, loop: Loop, evaluator: Evaluator, folder: RunFolder, log: McapWriter | None, stop: StopSignal
     ) -> Iterator[tuple[SensorFrame, Belief | None]]:
         """The frames of the loop until it ends or is stopped; shows them to observers and saves between them."""
-        saved = 0
+        saved = -SAVE_PERIOD
         for frame, belief in loop.drive(self.config.seconds, self._clock, log):
             if isinstance(frame, RgbdFrame):
                 self._images += 1
