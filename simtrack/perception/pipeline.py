@@ -60,6 +60,8 @@ class StackConfig:
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
     presegmentation: PresegmentationConfig = field(default_factory=PresegmentationConfig)
     scene_graph: SceneGraphConfig = field(default_factory=SceneGraphConfig)
+    lidar_presegmentation_every: int = 2
+    """Every how many-th scan is segmented."""
 
 
 class PerceptionStack:
@@ -108,6 +110,8 @@ class PerceptionStack:
         """Called with every answer of the detector as it is given (recorders listen here)."""
         self._joints: deque[JointState] = deque(maxlen=64)
         self._lidar: Presegmentation | None = None
+        self._scans = 0
+        self._own_shots: tuple[LidarScan, np.ndarray] | None = None
         self._belief: Belief | None = None
         self._status: dict[str, Status] = {}
         self._seconds: dict[str, float] = {}
@@ -154,6 +158,9 @@ class PerceptionStack:
         if localization is not None:
             self._status["localization"] = localization.status
         if localization is None or localization.status in (Status.STALE, Status.NO_DATA, Status.FAILED):
+            return
+        self._scans += 1
+        if self._scans % self.config.lidar_presegmentation_every:
             return
         with self._timed("presegmentation"):
             self._lidar = self._guard("presegmentation", lambda: self._presegment_scan(scan), self._lidar)
@@ -235,7 +242,9 @@ class PerceptionStack:
     # ---------------------------------------------------------------------------------------------------------- support
 
     def _own_lidar_shots(self, scan: LidarScan) -> np.ndarray:
-        return self.self_filter.lidar_mask(scan, self._joint_positions(scan.stamp))
+        if self._own_shots is None or self._own_shots[0] is not scan:
+            self._own_shots = scan, self.self_filter.lidar_mask(scan, self._joint_positions(scan.stamp))
+        return self._own_shots[1]
 
     def _joint_positions(self, stamp: int) -> dict[str, float]:
         """Encoder readings nearest in time to a stamp."""

@@ -39,6 +39,8 @@ class FitConfig:
     """A fit with less support than this is tried again from turned starts ..."""
     good_misfit: float = 1.3
     """... and so is one with a larger misfit than this."""
+    promising: float = 0.4
+    """... unless it has even less support than this: nothing like the model is there."""
     retry_angle: float = np.deg2rad(14.0)
     """How far those starts are turned, radians."""
     align_reach: float = 0.3
@@ -69,11 +71,11 @@ class Prober:
     """Registers one candidate at a time in a scene of its own."""
 
     def __init__(self, registration: RegistrationConfig, fit: FitConfig) -> None:
-        wide = Step(gate=0.06, kernel=16.0, edge_reach=18, silhouettes="always")
+        wide = Step(gate=0.06, kernel=16.0, edge_reach=18, silhouettes="always", coarsen=2)
         schedule = (wide, wide, *registration.schedule)
         probe = replace(registration, schedule=schedule)
         self._fit = fit
-        self._coarse = [replace(step, repeats=1) for step in (wide, *schedule[:5])]
+        self._coarse = [replace(step, repeats=1, coarsen=2) for step in schedule[:5]]
         self._refine = schedule[3:]
         self._follow = registration.track_schedule
         self._registration = Registration(probe)
@@ -94,7 +96,7 @@ class Prober:
         self._show(model)
         starts = [self._align_depth(h.T_camera_object, depth, intrinsics) for h in hypotheses]
         result = self._best_of(starts, depth, intrinsics)
-        if result is None or not self._good(result):
+        if result is not None and self._fit.promising < result.support and not self._good(result):
             turned = [_turned(starts[0], axis, sign * self._fit.retry_angle) for axis in range(3) for sign in (1, -1)]
             result = min((r for r in (result, self._best_of(turned, depth, intrinsics)) if r), key=cost, default=None)
         if result is None or not believable(result, self._fit):

@@ -33,7 +33,7 @@ from simtrack.raycast import RayBundle, RayScene
 class PresegmentationConfig:
     """Settings of `presegment_camera` and `presegment_lidar`."""
 
-    stride: int = 2
+    stride: int = 3
     """Pixel grid on which the believed world is cast; measurements are tested at full resolution."""
     map_sigma: float = 0.006
     """Standard deviation of the map's surface and of the pose, metres."""

@@ -31,6 +31,8 @@ class Step:
     """Scale of the Geman-McClure kernel, standard deviations."""
     edge_reach: int
     """How far from the model's edge a discontinuity is sought, pixels."""
+    coarsen: int = 1
+    """Take every so many-th row and column of each model's pixel grid."""
     repeats: int = 1
     """Cast again up to this often while an instance still moves by more than the configured tolerance."""
     silhouettes: Literal["always", "where-open", "never"] = "where-open"
@@ -45,8 +47,8 @@ class RegistrationConfig:
     solver: Literal["gauss-newton", "umeyama"] = "gauss-newton"
     """``umeyama`` is the tracking paper's closed-form fit, iterated on fixed correspondences."""
     schedule: tuple[Step, ...] = (
-        Step(gate=0.04, kernel=12.0, edge_reach=14, silhouettes="always"),
-        Step(gate=0.03, kernel=8.0, edge_reach=12, silhouettes="always"),
+        Step(gate=0.04, kernel=12.0, edge_reach=14, silhouettes="always", coarsen=2),
+        Step(gate=0.03, kernel=8.0, edge_reach=12, silhouettes="always", coarsen=2),
         Step(gate=0.02, kernel=6.0, edge_reach=10, silhouettes="always"),
         Step(gate=0.012, kernel=4.0, edge_reach=8, silhouettes="always", repeats=6),
         Step(gate=0.008, kernel=3.0, edge_reach=6),
@@ -54,8 +56,8 @@ class RegistrationConfig:
     )
     """Outer iterations, coarse to fine."""
     track_schedule: tuple[Step, ...] = (
-        Step(gate=0.02, kernel=6.0, edge_reach=8, silhouettes="always"),
-        Step(gate=0.01, kernel=4.0, edge_reach=6),
+        Step(gate=0.02, kernel=6.0, edge_reach=8, silhouettes="always", coarsen=2),
+        Step(gate=0.01, kernel=4.0, edge_reach=6, coarsen=2),
         Step(gate=0.006, kernel=3.0, edge_reach=5, repeats=2),
     )
     """Outer iterations from a good prediction, as of a track."""
@@ -87,7 +89,7 @@ class RegistrationConfig:
     """Error of the pose that more pixels do not average out (model scale, sensor bias), metres."""
     systematic_rotation: float = 0.003
     """As `systematic_translation`, radians."""
-    max_rays: int = 5000
+    max_rays: int = 2500
     """Coarser pixel grids are used for models whose image window holds more pixels than this."""
 
     def __post_init__(self) -> None:
@@ -201,8 +203,9 @@ class Registration:
             return {}
         batch = None
         for step in schedule or self.config.schedule:
+            grid = {i: stride * step.coarsen for i, stride in strides.items()}
             for _ in range(step.repeats):
-                batch = _Batch(self, depth, intrinsics, current, strides, step)
+                batch = _Batch(self, depth, intrinsics, current, grid, step)
                 batch.solve(self.config.inner_iterations)
                 current = batch.poses()
                 for instance, T in current.items():
