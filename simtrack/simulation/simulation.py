@@ -18,7 +18,7 @@ from simtrack.contracts import (
 )
 from simtrack.errors import FileFormatError, SimtrackError
 from simtrack.geometry.kinematics import KinematicTree
-from simtrack.geometry.transforms import transform
+from simtrack.geometry.transforms import rotation_from_rpy, transform
 from simtrack.objects import ObjectModel, TrackerModelConfig, tracker_model
 from simtrack.raycast import RayBundle
 from simtrack.sensors.camera import XTION, CameraModel
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 PROPRIOCEPTION_NS = 20_000_000
 """Nanoseconds between odometry readings and between joint states: 50 Hz."""
+START_SIGMA = np.array([0.03, 0.03, np.deg2rad(2.0)])
+"""How well the robot is told where it starts: standard deviations of x, y, metres, and heading, radians."""
 FAR = 10.0
 """Metres beyond which a depth camera of this kind reads nothing, so that nothing is rendered there."""
 
@@ -151,8 +153,11 @@ class Simulation:
 
     @property
     def start(self) -> Float64:
-        """(4, 4) T_map_base at stamp 0: what the robot is told of where it starts."""
-        return self.truth.at(0).T_map_base
+        """(4, 4) T_map_base at stamp 0, as an operator would state it: off by a few centimetres and degrees."""
+        x, y, yaw = START_SIGMA * stream(self.seed, "start").standard_normal(3)
+        told = self.truth.at(0).T_map_base @ transform(rotation_from_rpy(0.0, 0.0, yaw))
+        told[:2, 3] += x, y
+        return told
 
     # -------------------------------------------------------------------------------------------------------- the clock
 
