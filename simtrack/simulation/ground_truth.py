@@ -85,6 +85,8 @@ class GroundTruth:
         self._alone: RayScene | None = None
         self._lidar: dict[int, Int32] = {}
         self._full: RayBundle | None = None
+        self._seen: tuple[int, dict[str, Visibility]] | None = None
+        """The last answer of `visibility`: detector and evaluation ask about the same images."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -137,6 +139,11 @@ class GroundTruth:
 
     def visibility(self, stamp: int) -> dict[str, Visibility]:
         """How much of each object (catalogue and clutter) the camera sees; objects behind it are not seen at all."""
+        if self._seen is None or self._seen[0] != stamp:
+            self._seen = stamp, self._look(stamp)
+        return dict(self._seen[1])
+
+    def _look(self, stamp: int) -> dict[str, Visibility]:
         self._load(stamp)
         T_map_camera = body_pose(self._scratch, self._sensors["camera"])
         names, poses = self._object_poses()

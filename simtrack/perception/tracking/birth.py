@@ -35,6 +35,8 @@ class FitConfig:
     """Largest RMS residual along the normal, metres, at 1 m distance; grows with its square."""
     constrained: int = 4
     """Fewest directions that the data must constrain."""
+    rotation_sigma: float = np.deg2rad(2.5)
+    """Largest standard deviation of a constrained orientation, radians: a small thing far away fits in many ways."""
     good_support: float = 0.95
     """A fit with less support than this is tried again from turned starts ..."""
     good_misfit: float = 1.3
@@ -58,12 +60,15 @@ def cost(result: RegistrationResult, gate: float = 0.012) -> float:
 def believable(result: RegistrationResult, config: FitConfig) -> bool:
     """Whether a registered pose is well supported by the measurements."""
     z = float(result.T_camera_object[2, 3])
+    variances = np.linalg.eigvalsh(result.covariance[3:, 3:])
+    known = variances[variances < 1.0]  # unconstrained directions have far larger ones
     return (
         result.support >= config.support
         and result.supported * result.stride**2 >= config.pixels
         and result.residual <= config.residual * max(1.0, z) ** 2
         and result.constrained >= config.constrained
         and result.occluded <= config.occluded * result.rays
+        and bool(np.all(known <= config.rotation_sigma**2))
     )
 
 
