@@ -42,7 +42,7 @@ class ExplorerConfig:
     """m/s."""
     max_angular: float = 1.0
     """rad/s."""
-    memory: float = 12.0
+    memory: float = 30.0
     """A surface with tracks on it that has not been looked at for this long is looked at again, seconds."""
     search_time: float = 8.0
     """A lost object is sought for this long, seconds."""
