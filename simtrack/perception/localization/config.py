@@ -129,7 +129,7 @@ class SearchConfig:
 class RecoveryConfig:
     """When the pose counts as lost, and what it takes to believe a new one."""
 
-    collapse: float = 0.7
+    collapse: float = 0.6
     """Lost if the explained share of the structure falls below this share of its running level ..."""
     collapse_scans: int = 3
     """... in so many consecutive scans."""

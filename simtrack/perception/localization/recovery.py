@@ -17,6 +17,9 @@ from simtrack.perception.localization.surface import MapSurface
 MEMORY = 15
 """Scans over which a hypothesis is judged."""
 
+INCUMBENT_BONUS = 0.2
+"""Score: changes since the survey cost a true pose up to about as much; a robot that was carried off loses more."""
+
 
 @dataclass(slots=True)
 class Hypothesis:
@@ -35,7 +38,8 @@ class Hypothesis:
     settled: bool = False
     """Its last registration converged."""
     prior: float = 0.0
-    """Added to the score: how well it agrees with a given start pose, 0 at best."""
+    """Added to the score: less the farther it is from a given start pose, and a bonus for what was believed before, as
+    robots are seldom carried off."""
     scores: deque[float] = field(default_factory=lambda: deque(maxlen=MEMORY))
     shares: deque[float] = field(default_factory=lambda: deque(maxlen=MEMORY))
     """Explained share of the structure, one a scan."""
@@ -109,7 +113,7 @@ class HypothesisSet:
             h.streak = h.streak + 1 if fresh and h.near(fresh[0][1]) else 0
         for rank, (score, pose) in enumerate(fresh):
             if score > fresh[0][0] - 0.4 and not any(h.near(pose) for h in self.items):
-                prior = _agreement(pose, start)
+                prior = _agreement(pose, start) + (INCUMBENT_BONUS if incumbent else 0.0)
                 self.items.append(
                     Hypothesis(pose, covariance.copy(), travel, int(rank == 0), incumbent=incumbent, prior=prior)
                 )
@@ -138,6 +142,7 @@ class HypothesisSet:
                     twin.scores, twin.shares, twin.verdicts, twin.travel = h.scores, h.shares, h.verdicts, h.travel
                 twin.streak = max(twin.streak, h.streak)
                 twin.incumbent |= h.incumbent
+                twin.prior = max(twin.prior, h.prior)
             elif not kept or h.incumbent or h.score > kept[0].score - 0.35:
                 kept.append(h)
         limit = self._config.recovery.hypotheses
