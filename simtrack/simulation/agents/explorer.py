@@ -34,7 +34,7 @@ class ExplorerConfig:
     """How long that is, seconds."""
     dwell: float = 0.9
     """How long a patch has to be in view until it counts as explored, seconds."""
-    view_distance: tuple[float, float] = (0.8, 2.1)
+    view_distance: tuple[float, float] = (0.8, 1.8)
     """Distances from which a surface is looked at, metres."""
     reach: float = 2.6
     """Patches further than this from the camera are not seen well enough, metres."""
@@ -223,7 +223,9 @@ class ExplorerAgent:
         pan, tilt = head_angles(target, T_map_base, belief.T_map_camera[:3, 3])
         linear, angular = 0.0, 0.0
         path = self._goal.path if self._goal is not None else None
-        if path is not None and np.linalg.norm(path[-1] - T_map_base[:2, 3]) > 0.12:
+        if self._goal is not None and path is not None and np.linalg.norm(path[-1] - T_map_base[:2, 3]) < 0.25:
+            self._goal, path = _Viewpoint(self._goal.entity, None), None  # arrived
+        if path is not None:
             linear, angular = self._follow(path, T_map_base)
         elif abs(pan) > 0.9:
             angular = float(
