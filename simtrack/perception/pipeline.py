@@ -146,7 +146,12 @@ class PerceptionStack:
         """MICP-L in the believed scene: what stands before the map is seen, not taken for the map."""
         scene = self.believed.scene
         localizer = MeshLocalizer(
-            static_map, self.config.localizer, scene, map_instance=MAP, lidar_mask=self._own_lidar_shots
+            static_map,
+            self.config.localizer,
+            scene,
+            map_instance=MAP,
+            lidar_mask=self._own_lidar_shots,
+            depth_mask=self._own_pixels,
         )
         if T_map_base is not None:
             localizer.initialise(0, T_map_base)
@@ -183,7 +188,8 @@ class PerceptionStack:
             return self._repeat() if self._belief is not None else self._nothing(frame.stamp)
         self._status["frame"] = Status.OK if np.any(frame.depth > 0.0) else Status.NO_DATA
 
-        localization = self.localizer.pose_at(frame.stamp)
+        with self._timed("localization"):
+            localization = self._locate(frame)
         T_map_camera = localization.T_map_base @ frame.T_base_camera
         covariance = _camera_covariance(localization, T_map_camera)
 
@@ -215,6 +221,16 @@ class PerceptionStack:
         self._seconds.clear()
         return self._belief
 
+    def _locate(self, frame: RgbdFrame) -> Localization:
+        """Pose at an image's stamp; the image itself helps where the lidar is silent or leaves directions open."""
+        if isinstance(self.localizer, MeshLocalizer):
+            localizer = self.localizer
+            found = self._guard("localization", lambda: localizer.update_depth(frame), None)
+            if found is not None:
+                self._status["localization"] = found.status
+                return found
+        return self.localizer.pose_at(frame.stamp)
+
     def _track(
         self, frame: RgbdFrame, T_map_camera: Float64, covariance: Float64, hypotheses: Sequence[PoseHypothesis]
     ) -> TrackerResult:
@@ -227,7 +243,7 @@ class PerceptionStack:
         return result
 
     def _presegment_image(self, frame: RgbdFrame, T_map_camera: Float64) -> Presegmentation:
-        own = self.self_filter.camera_mask(frame, self._joint_positions(frame.stamp))
+        own = self._own_pixels(frame)
         return presegment_camera(frame, T_map_camera, self.believed.scene, own, self.config.presegmentation)
 
     def _detect(self, frame: RgbdFrame, camera: Presegmentation | None) -> None:
@@ -240,6 +256,9 @@ class PerceptionStack:
         return self.graph.update(stamp, tracked.tracks)
 
     # ---------------------------------------------------------------------------------------------------------- support
+
+    def _own_pixels(self, frame: RgbdFrame) -> np.ndarray:
+        return self.self_filter.camera_mask(frame, self._joint_positions(frame.stamp))
 
     def _own_lidar_shots(self, scan: LidarScan) -> np.ndarray:
         if self._own_shots is None or self._own_shots[0] is not scan:
