@@ -141,6 +141,25 @@ class Prober:
         self._show(model)
         return self._registration.assess(depth, intrinsics, {PROBE: T_camera_object}).get(PROBE)
 
+    def shared(
+        self,
+        T_camera_object: Float64,
+        model: TrackedModel,
+        T_camera_other: Float64,
+        other: TrackedModel,
+        depth: Float32,
+        intrinsics: CameraIntrinsics,
+    ) -> float:
+        """Share of the measurements on a candidate that another object, where it stands, explains as well, 0 to 1.
+
+        A thing in a container shares its place with it, but not its surface.
+        """
+        self._show(model)
+        mine = self._registration.explained(depth, intrinsics, PROBE, T_camera_object)
+        self._show(other)
+        theirs = self._registration.explained(depth, intrinsics, PROBE, T_camera_other)
+        return float(np.count_nonzero(mine & theirs)) / max(int(np.count_nonzero(mine)), 1)
+
     def _show(self, model: TrackedModel) -> None:
         if self._model is not model:
             if self._model is not None:

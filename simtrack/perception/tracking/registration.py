@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from simtrack.contracts import CameraIntrinsics, Float32, Float64, Int32
+from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, Int32
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import orthonormal
 from simtrack.perception.tracking import correspondences as kernels
@@ -243,6 +243,21 @@ class Registration:
         out = np.empty(len(pixels))
         count = kernels.ray_differences(pixels, hits.distances, hits.instances, depth, instance, reach, out)
         return out[:count]
+
+    def explained(self, depth: Float32, intrinsics: CameraIntrinsics, instance: int, T_camera_object: Float64) -> Bool:
+        """(H, W), True where a lone instance at a pose explains the measured depth."""
+        out = np.zeros(depth.shape, bool)
+        for other in self._models:
+            self._scene.set_enabled(other, other == instance)
+        self._scene.set_pose(instance, T_camera_object)
+        window = self._window(instance, T_camera_object, intrinsics)
+        if window is not None:
+            hits, pixels = self._cast(intrinsics, [(window, 2)])
+            measured = depth.reshape(-1)[pixels]
+            variance = kernels.axial_variance(float(T_camera_object[2, 3]), 0.8, self.config.focal_baseline)
+            reach = self.config.schedule[-1].gate + 3.0 * np.sqrt(variance)
+            out.reshape(-1)[pixels] = (measured > 0.0) & (np.abs(measured - hits.distances) < reach)
+        return out
 
     def _place(
         self, intrinsics: CameraIntrinsics, poses: Mapping[int, Float64], fixed: Mapping[int, Float64] | None

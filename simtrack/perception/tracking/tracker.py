@@ -71,6 +71,14 @@ class TrackerConfig:
     """A registration that moves a track further than this from its prediction, metres, is not believed."""
     disagreement: float = np.deg2rad(25.0)
     """Detections that differ from a registered track by more than this put its orientation to the test, radians."""
+    doubt: float = np.deg2rad(14.0)
+    """... or by more than this, if its fit is doubtful ..."""
+    doubtful_support: float = 0.95
+    """... with less support than this ..."""
+    doubtful_misfit: float = 0.85
+    """... or a larger misfit than this."""
+    shared_surface: float = 0.4
+    """Two objects cannot both be there if they explain more than this share of the same measurements."""
     localization_correlation: float = 0.3
     """Time over which errors of the robot's pose are correlated, seconds."""
     same_object_speed: float = 0.7
@@ -288,15 +296,24 @@ class ObjectTracker:
         """Take a detection of a tracked object: fuse it, or let it contest an orientation that it disagrees with."""
         apart = [rotation_apart(h.T_camera_object, T_camera_object, target.model) for h in group]
         nearest = group[int(np.argmin(apart))]
-        if min(apart) <= self.config.disagreement:
+        limit = self.config.doubt if self._doubtful(target) else self.config.disagreement
+        if min(apart) <= limit:
             target.disagreements = 0
             target.detections += 1
             target.score = min(0.99, target.score + 0.1)
             self._fuse_late(target, T_camera_object, nearest, view)
             return
         target.disagreements += 1
-        if target.disagreements >= 2 or target.status is TrackStatus.TENTATIVE or view.stamp > target.last_seen:
+        unsettled = target.status is TrackStatus.TENTATIVE or view.stamp > target.last_seen or self._doubtful(target)
+        if unsettled or target.disagreements >= 2:
             self._contest(target, T_camera_object, group, view)
+
+    def _doubtful(self, target: _Target) -> bool:
+        """Whether a track's last registration may have slid into a wrong minimum."""
+        result = target.result
+        return result is not None and (
+            result.support < self.config.doubtful_support or result.misfit > self.config.doubtful_misfit
+        )
 
     def _fuse_late(self, target: _Target, T_camera_object: Float64, h: PoseHypothesis, view: _View) -> None:
         """Fuse a detection's pose at its own stamp, unless it lies outside of its own error bounds."""
@@ -330,14 +347,22 @@ class ObjectTracker:
         if result is None:
             return
         T_map_object = view.T_map_camera @ result.T_camera_object
-        for other in self._targets:
+        for other in list(self._targets):
             T_other = other.filter.pose_at(view.stamp)
             if not other.alive or box_overlap(T_map_object, model.extents, T_other, other.model.extents) < 0.2:
                 continue
+            T_camera_other = inverse(view.T_map_camera) @ T_other
             if other.model is model:
-                self._confirm(other, inverse(view.T_map_camera) @ T_other, group, view)
+                self._confirm(other, T_camera_other, group, view)
                 return
-            if not self._outdoes(result, other, T_other, view):
+            rival = self._tracked[other.model.name]
+            tracked = self._tracked[model.name]
+            shared = self._prober.shared(
+                result.T_camera_object, tracked, T_camera_other, rival, view.depth, view.intrinsics
+            )
+            if shared < self.config.shared_surface:
+                continue
+            if not self._outdoes(result, other, T_camera_other, view):
                 return
             self._lose(other)
         followed = self._follow_up(model, result, view)
@@ -348,10 +373,9 @@ class ObjectTracker:
         target.residual, target.missing_since = result.residual, None
         self._registration.add(target.id, self._tracked[model.name])
 
-    def _outdoes(self, result: RegistrationResult, other: _Target, T_other: Float64, view: _View) -> bool:
+    def _outdoes(self, result: RegistrationResult, other: _Target, T_camera_other: Float64, view: _View) -> bool:
         """Whether a candidate of another class explains a place clearly better than the track that holds it."""
-        T = inverse(view.T_map_camera) @ T_other
-        holder = self._prober.judge(T, self._tracked[other.model.name], view.depth, view.intrinsics)
+        holder = self._prober.judge(T_camera_other, self._tracked[other.model.name], view.depth, view.intrinsics)
         if holder is None:
             return False
         established = 3.0 if other.status is not TrackStatus.TENTATIVE else 1.5

@@ -30,7 +30,7 @@ class ExplorerConfig:
     """Map entities on which objects are sought first."""
     further_classes: tuple[str, ...] = ("table", "desk", "cart")
     """Map entities on which objects are sought when nothing has moved for a while."""
-    calm: float = 6.0
+    calm: float = 15.0
     """How long that is, seconds."""
     dwell: float = 0.9
     """How long a patch has to be in view until it counts as explored, seconds."""
