@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from simtrack.contracts import (
+    NANOSECONDS,
     Belief,
     DetectionResult,
     Detector,
@@ -60,6 +61,8 @@ class StackConfig:
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
     presegmentation: PresegmentationConfig = field(default_factory=PresegmentationConfig)
     scene_graph: SceneGraphConfig = field(default_factory=SceneGraphConfig)
+    lidar_silence: float = 0.5
+    """Without a scan for this long, seconds, depth images localize the robot."""
     lidar_presegmentation_every: int = 2
     """Every how many-th scan is segmented."""
 
@@ -111,6 +114,8 @@ class PerceptionStack:
         self._joints: deque[JointState] = deque(maxlen=64)
         self._lidar: Presegmentation | None = None
         self._scans = 0
+        self._last_scan: int | None = None
+        self._fresh_scan = False
         self._own_shots: tuple[LidarScan, np.ndarray] | None = None
         self._belief: Belief | None = None
         self._status: dict[str, Status] = {}
@@ -164,6 +169,7 @@ class PerceptionStack:
             self._status["localization"] = localization.status
         if localization is None or localization.status in (Status.STALE, Status.NO_DATA, Status.FAILED):
             return
+        self._last_scan, self._fresh_scan = scan.stamp, True
         self._scans += 1
         if self._scans % self.config.lidar_presegmentation_every:
             return
@@ -222,8 +228,16 @@ class PerceptionStack:
         return self._belief
 
     def _locate(self, frame: RgbdFrame) -> Localization:
-        """Pose at an image's stamp; the image itself helps where the lidar is silent or leaves directions open."""
-        if isinstance(self.localizer, MeshLocalizer):
+        """Pose at an image's stamp.
+
+        Where the lidar has been silent, or left directions open, the image itself helps: then the first image after
+        each scan, so that the next scan is not older than what is known already.
+        """
+        if self._last_scan is None:
+            self._last_scan = frame.stamp
+        silent = frame.stamp - self._last_scan > self.config.lidar_silence * NANOSECONDS
+        if isinstance(self.localizer, MeshLocalizer) and (silent or self._fresh_scan):
+            self._fresh_scan = False
             localizer = self.localizer
             found = self._guard("localization", lambda: localizer.update_depth(frame), None)
             if found is not None:

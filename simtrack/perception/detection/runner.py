@@ -59,7 +59,7 @@ class DetectorRunner:
         latest = frame.stamp + int(self.config.patience * NANOSECONDS)
         result = self._call(frame, regions)
         self._free_at = latest
-        if result is None:
+        if result is None or result.status in (Status.FAILED, Status.NO_DATA):
             self.status, self._free_at = Status.FAILED, frame.stamp + NANOSECONDS // 4
             return None
         if result.available > latest:
