@@ -8,7 +8,7 @@ and SLAM*, ICRA 2014 (simkinect). What is marked as a choice of this project has
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -168,6 +168,10 @@ def axial_sigma(z: npt.ArrayLike, theta: npt.ArrayLike = 0.0) -> Float64:
     return PRESETS["xtion"].sigma(z, theta)
 
 
+DepthDraws: TypeAlias = tuple[Float32, npt.NDArray[np.uint32], Float32]
+"""The random numbers of one image, see `draw_depth_noise`."""
+
+
 def apply_depth_noise(
     depth_true: Float32,
     normals: Float32 | None,
@@ -175,6 +179,7 @@ def apply_depth_noise(
     config: DepthNoiseConfig,
     rng: np.random.Generator,
     albedo: Float32 | None = None,
+    draws: DepthDraws | None = None,
 ) -> Float32:
     """What the sensor reads of a true depth image.
 
@@ -187,6 +192,7 @@ def apply_depth_noise(
         config: the noise.
         rng: the source of randomness.
         albedo: (H, W), 0..1 in the infrared, or None for no losses on dark surfaces.
+        draws: from `draw_depth_noise`, for an image of this size; None draws from `rng` now.
 
     Returns:
         (H, W) float32, metres, 0 = no reading, never NaN.
@@ -205,7 +211,7 @@ def apply_depth_noise(
     ):
         if array is not None and array.shape != wanted:
             raise InvalidValueError(name, array.shape, f"shape {wanted}, as the intrinsics say")
-    axial, shifts, uniform = _draw(shape, config, rng)
+    axial, shifts, uniform = draw_depth_noise(intrinsics, config, rng) if draws is None else draws
     parameters = _kernel_parameters(config)
     camera = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
     inverse = kernels.inverse_depth(depth)
@@ -256,12 +262,14 @@ def _kernel_parameters(config: DepthNoiseConfig) -> "Parameters":
     )  # fmt: skip
 
 
-def _draw(
-    shape: tuple[int, int], config: DepthNoiseConfig, rng: np.random.Generator
-) -> tuple[Float32, npt.NDArray[np.uint32], Float32]:
-    """Axial noise (H, W) of unit variance, random bits (H, W) for lateral shifts, uniform numbers (1 or 2, H, W)."""
+def draw_depth_noise(intrinsics: CameraIntrinsics, config: DepthNoiseConfig, rng: np.random.Generator) -> DepthDraws:
+    """The randomness of one image, which does not depend on what is in it: so it can be drawn ahead of time.
+
+    Returns axial noise (H, W) of unit variance, random bits (H, W) for lateral shifts, uniform numbers (1 or 2, H, W).
+    """
     from simtrack.sensors import depth_kernels as kernels
 
+    shape = (intrinsics.height, intrinsics.width)
     axial = np.zeros((0, 0), np.float32)
     if config.simkinect or config.axial_offset or config.axial_quadratic or config.axial_grazing:
         axial = rng.standard_normal(shape, dtype=np.float32)

@@ -1,6 +1,7 @@
 """The clock: runs physics, hand and robot, and lets every sensor look at its own time."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -35,7 +36,7 @@ from simtrack.simulation.world import SENSOR_BODIES, TIMESTEP_NS, build_world, c
 from simtrack.simulation.world_rays import WorldRays
 
 if TYPE_CHECKING:
-    pass
+    from simtrack.sensors.depth_noise import DepthDraws
 
 PROPRIOCEPTION_NS = 20_000_000
 """Nanoseconds between odometry readings and between joint states: 50 Hz."""
@@ -82,6 +83,8 @@ class Simulation:
         self._configure()
         self._data = self.world.data
         self._scratch = mujoco.MjData(self.world.model)
+        self._scan_scratch = mujoco.MjData(self.world.model)
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="simtrack-sensors")
         self._history = History(self.world.model)
         self._rays = WorldRays(self.world)
         self.truth = GroundTruth(self.world, self._history, self._rays, intrinsics)
@@ -97,6 +100,7 @@ class Simulation:
         self._static_map: StaticMap | None = None
         self._models: dict[str, ObjectModel] | None = None
         self._remember()
+        self._draws = self._worker.submit(self._draw_noise)
 
     def _configure(self) -> None:
         """Sensor configurations from the scene file; raises FileFormatError."""
@@ -188,9 +192,15 @@ class Simulation:
         while self._history.end < target:
             self._step(command)
         self._due(PROPRIOCEPTION_NS, "proprioception", target, self._send_proprioception)
-        self._due(self.lidar.period, "lidar", target - self.lidar.period, self._send_scan)
         self._now = target
-        self._send_image(target, want_rgb)
+        # The lidar looks while the camera is rendered, unless both cast rays into the same scene.
+        scans = self._worker.submit(self._due, self.lidar.period, "lidar", target - self.lidar.period, self._send_scan)
+        if self.renderer != "mujoco":
+            scans.result()
+        image = self._take_image(target, want_rgb)
+        scans.result()
+        self._feed.send(self.calibration.apply(image), target)
+        self._draws = self._worker.submit(self._draw_noise)
         return self._feed.receive(target)
 
     def _due(self, period: int, sensor: str, until: int, send: Callable[[int], None]) -> None:
@@ -231,28 +241,33 @@ class Simulation:
         assert isinstance(reading, JointState)
         return reading
 
-    def _send_image(self, stamp: int, want_rgb: bool) -> None:
+    def _draw_noise(self) -> "DepthDraws":
+        from simtrack.sensors.depth_noise import draw_depth_noise
+
+        return draw_depth_noise(self.camera.intrinsics, self.depth_noise, self._rng_depth)
+
+    def _take_image(self, stamp: int, want_rgb: bool) -> RgbdFrame:
         from simtrack.sensors.depth_noise import apply_depth_noise
 
         self._history.load(stamp, self._scratch)
         exact = self._renderer.depth(self._scratch)
-        depth = apply_depth_noise(exact, None, self.camera.intrinsics, self.depth_noise, self._rng_depth)
+        draws = self._draws.result()
+        depth = apply_depth_noise(exact, None, self.camera.intrinsics, self.depth_noise, self._rng_depth, draws=draws)
         rgb = self._renderer.rgb(self._scratch) if want_rgb else None
         joints = self._encoders(self._history.qpos(stamp), stamp, self._rng_camera_pose)
         believed = self.robot.forward(dict(zip(joints.names, joints.positions.tolist(), strict=True)))["camera"]
         sequence = self._counts["camera"] - 1
-        frame = RgbdFrame(stamp, depth, rgb, self.camera.intrinsics, believed, sequence)
-        self._feed.send(self.calibration.apply(frame), stamp)
+        return RgbdFrame(stamp, depth, rgb, self.camera.intrinsics, believed, sequence)
 
     def _send_scan(self, stamp: int) -> None:
         """One turn: each shot is cast from where sensor and objects are at its own time."""
         shots, keys = self._shots, round(self.lidar.period / KEY_NS) + 1
         poses, sensor = [], np.empty((keys, 4, 4))
         for k in range(keys):
-            self._history.load(stamp + k * self.lidar.period / (keys - 1), self._scratch)
-            poses.append(self._rays.poses(self._scratch))
-            R = self._scratch.xmat[self._lidar_body].reshape(3, 3)
-            sensor[k] = transform(R, self._scratch.xpos[self._lidar_body])
+            self._history.load(stamp + k * self.lidar.period / (keys - 1), self._scan_scratch)
+            poses.append(self._rays.poses(self._scan_scratch))
+            R = self._scan_scratch.xmat[self._lidar_body].reshape(3, 3)
+            sensor[k] = transform(R, self._scan_scratch.xpos[self._lidar_body])
         self._rays.move(poses)
         times = shots.times.astype(np.float64) * (NANOSECONDS / self.lidar.period)
         index = np.minimum((times * (keys - 1)).astype(np.int64), keys - 2)
@@ -277,6 +292,7 @@ class Simulation:
 
     def close(self) -> None:
         """Release OpenGL and ray scenes; may be called twice. What was measured stays readable."""
+        self._worker.shutdown(wait=True)
         self._renderer.close()
         self.truth.close()
         self._rays.close()
