@@ -21,6 +21,7 @@ from simtrack.contracts import (
     Agent,
     Belief,
     Command,
+    Float64,
     JointState,
     RgbdFrame,
     SensorFrame,
@@ -157,12 +158,19 @@ class Loop:
                     joints = frame
                 if log is not None:
                     log.write(frame, simulation.now)
+                    if isinstance(frame, RgbdFrame):
+                        log.write_labels(frame.stamp, self._labels(frame.stamp))
                 with clock("stack"):
                     belief = self.stack.process(frame)
                 if belief is not None:
                     with clock("agent"):
                         command = self.agent.act(belief, joints)
                 yield frame, belief
+
+    def _labels(self, stamp: int) -> dict[str, Float64]:
+        """True poses in the map, for people who read the log: the stack never does."""
+        truth = self.simulation.truth.at(stamp)
+        return {"base": truth.T_map_base, **{name: thing.T_map_object for name, thing in truth.objects.items()}}
 
 
 @contextmanager

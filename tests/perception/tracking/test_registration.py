@@ -96,9 +96,11 @@ def test_umeyama_converges_too_but_more_slowly() -> None:
     start = scenes.displaced(T_true, 0.01, 2.0, rng)
     schedule = (Step(gate=0.03, kernel=8.0, edge_reach=8, silhouettes="never", repeats=3),)
     kept = {}
-    for solver, inner in (("gauss-newton", 3), ("umeyama", 10)):
-        config = RegistrationConfig(solver=solver, schedule=schedule, inner_iterations=inner)
-        kept[solver] = _errors(
+    for config in (
+        RegistrationConfig(solver="gauss-newton", schedule=schedule, inner_iterations=3),
+        RegistrationConfig(solver="umeyama", schedule=schedule, inner_iterations=10),
+    ):
+        kept[config.solver] = _errors(
             scenes.register("powerdrill", world.depth(), start, config).T_camera_object, T_true, "powerdrill"
         )
     assert kept["umeyama"][0] < 0.008

@@ -114,7 +114,7 @@ def test_occluded_is_kept_and_gone_is_lost_and_found_again() -> None:
 def test_a_carried_object_is_followed() -> None:
     film = Film("multimeter")
     meter = film.put("multimeter", -0.2, 0.0, 0.3)
-    film.run(12)
+    track = film.run(12).tracks[0]
     for k in range(30):
         T = film.poses[meter][1].copy()
         T[:3, 3] += [0.4 / 30, 0.0, 0.1 / 30]
