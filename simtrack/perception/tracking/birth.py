@@ -1,7 +1,8 @@
 """From a detection's pose hypotheses to a registered candidate: depth alignment, registration, comparison of fits."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -35,12 +36,16 @@ class FitConfig:
     """Largest RMS residual along the normal, metres, at 1 m distance; grows with its square."""
     constrained: int = 4
     """Fewest directions that the data must constrain."""
-    rotation_sigma: float = np.deg2rad(2.5)
+    rotation_sigma: float = np.deg2rad(4.0)
     """Largest standard deviation of a constrained orientation, radians: a small thing far away fits in many ways."""
     good_support: float = 0.95
     """A fit with less support than this is tried again from turned starts ..."""
-    good_misfit: float = 1.3
+    good_misfit: float = 1.0
     """... and so is one with a larger misfit than this."""
+    misfit: float = 1.25
+    """A fit with a larger misfit than this is not believed."""
+    modes: int = 3
+    """Up to so many frequent depth differences are tried: the most frequent one may be that of an occluder."""
     promising: float = 0.4
     """... unless it has even less support than this: nothing like the model is there."""
     retry_angle: float = np.deg2rad(14.0)
@@ -66,14 +71,19 @@ def believable(result: RegistrationResult, config: FitConfig) -> bool:
         result.support >= config.support
         and result.supported * result.stride**2 >= config.pixels
         and result.residual <= config.residual * max(1.0, z) ** 2
+        and result.misfit <= config.misfit
         and result.constrained >= config.constrained
         and result.occluded <= config.occluded * result.rays
         and bool(np.all(known <= config.rotation_sigma**2))
     )
 
 
+Occluders: TypeAlias = Mapping[int, tuple[TrackedModel, Float64]]
+"""Track id -> model and T_camera_object of what is believed to stand around a candidate."""
+
+
 class Prober:
-    """Registers one candidate at a time in a scene of its own."""
+    """Registers one candidate at a time in a scene of its own, among the objects that are believed already."""
 
     def __init__(self, registration: RegistrationConfig, fit: FitConfig) -> None:
         wide = Step(gate=0.06, kernel=16.0, edge_reach=18, silhouettes="always", coarsen=2)
@@ -84,7 +94,8 @@ class Prober:
         self._refine = schedule[3:]
         self._follow = registration.track_schedule
         self._registration = Registration(probe)
-        self._model: TrackedModel | None = None
+        self._shown: dict[int, TrackedModel] = {}
+        self._fixed: dict[int, Float64] = {}
 
     def close(self) -> None:
         """Release the scene's memory."""
@@ -96,10 +107,11 @@ class Prober:
         model: TrackedModel,
         depth: Float32,
         intrinsics: CameraIntrinsics,
+        occluders: Occluders,
     ) -> RegistrationResult | None:
         """Register each alternative and return the one that fits best, or None if none can be believed."""
-        self._show(model)
-        starts = [self._align_depth(h.T_camera_object, depth, intrinsics) for h in hypotheses]
+        self._show(model, occluders)
+        starts = [T for h in hypotheses for T in self._aligned(h.T_camera_object, depth, intrinsics)]
         result = self._best_of(starts, depth, intrinsics)
         if result is not None and self._fit.promising < result.support and not self._good(result):
             turned = [_turned(starts[0], axis, sign * self._fit.retry_angle) for axis in range(3) for sign in (1, -1)]
@@ -125,21 +137,32 @@ class Prober:
     def _register(
         self, T_camera_object: Float64, depth: Float32, intrinsics: CameraIntrinsics, schedule: Sequence[Step]
     ) -> RegistrationResult | None:
-        return self._registration.register(depth, intrinsics, {PROBE: T_camera_object}, schedule=schedule).get(PROBE)
+        found = self._registration.register(depth, intrinsics, {PROBE: T_camera_object}, self._fixed, schedule)
+        return found.get(PROBE)
 
     def follow(
-        self, T_camera_object: Float64, model: TrackedModel, depth: Float32, intrinsics: CameraIntrinsics
+        self,
+        T_camera_object: Float64,
+        model: TrackedModel,
+        depth: Float32,
+        intrinsics: CameraIntrinsics,
+        occluders: Occluders,
     ) -> RegistrationResult | None:
         """Register a candidate from a near pose, as the next frame of a track."""
-        self._show(model)
+        self._show(model, occluders)
         return self._register(T_camera_object, depth, intrinsics, self._follow)
 
     def judge(
-        self, T_camera_object: Float64, model: TrackedModel, depth: Float32, intrinsics: CameraIntrinsics
+        self,
+        T_camera_object: Float64,
+        model: TrackedModel,
+        depth: Float32,
+        intrinsics: CameraIntrinsics,
+        occluders: Occluders,
     ) -> RegistrationResult | None:
         """How well a pose fits as it stands."""
-        self._show(model)
-        return self._registration.assess(depth, intrinsics, {PROBE: T_camera_object}).get(PROBE)
+        self._show(model, occluders)
+        return self._registration.assess(depth, intrinsics, {PROBE: T_camera_object}, self._fixed).get(PROBE)
 
     def shared(
         self,
@@ -154,32 +177,47 @@ class Prober:
 
         A thing in a container shares its place with it, but not its surface.
         """
-        self._show(model)
+        self._show(model, {})
         mine = self._registration.explained(depth, intrinsics, PROBE, T_camera_object)
-        self._show(other)
+        self._show(other, {})
         theirs = self._registration.explained(depth, intrinsics, PROBE, T_camera_other)
         return float(np.count_nonzero(mine & theirs)) / max(int(np.count_nonzero(mine)), 1)
 
-    def _show(self, model: TrackedModel) -> None:
-        if self._model is not model:
-            if self._model is not None:
-                self._registration.remove(PROBE)
-            self._registration.add(PROBE, model)
-            self._model = model
+    def _show(self, model: TrackedModel, occluders: Occluders) -> None:
+        """Put a candidate and what stands around it into the scene, and nothing else."""
+        wanted = {PROBE: model, **{i: other for i, (other, _) in occluders.items()}}
+        for instance in [i for i, shown in self._shown.items() if wanted.get(i) is not shown]:
+            self._registration.remove(instance)
+            del self._shown[instance]
+        for instance in [i for i in wanted if i not in self._shown]:
+            self._registration.add(instance, wanted[instance])
+            self._shown[instance] = wanted[instance]
+        self._fixed = {i: T for i, (_, T) in occluders.items()}
 
-    def _align_depth(self, T_camera_object: Float64, depth: Float32, intrinsics: CameraIntrinsics) -> Float64:
+    def _aligned(self, T_camera_object: Float64, depth: Float32, intrinsics: CameraIntrinsics) -> list[Float64]:
         """Slide the model along the viewing ray of its centre until its rendered depth matches the measured one.
 
-        The most frequent difference counts, not the mean: the window holds background and occluders too.
+        The most frequent differences count, not the mean: the window holds background and occluders too.
         """
-        T = T_camera_object.copy()
-        for reach, width in ((self._fit.align_reach, 0.03), (0.08, 0.015)):
-            differences = self._registration.depth_differences(depth, intrinsics, PROBE, T, reach)
-            if len(differences) < 20:
-                return T
-            shift = _mode(differences, width)
-            T[:3, 3] *= (T[2, 3] + shift) / T[2, 3]
-        return T
+        starts = []
+        differences = self._differences(T_camera_object, depth, intrinsics, self._fit.align_reach)
+        for shift in _modes(differences, 0.03, self._fit.modes):
+            T = _slid(T_camera_object, shift)
+            finer = _modes(self._differences(T, depth, intrinsics, 0.08), 0.015, 1)
+            starts.append(_slid(T, finer[0]) if finer else T)
+        return starts or [T_camera_object]
+
+    def _differences(
+        self, T_camera_object: Float64, depth: Float32, intrinsics: CameraIntrinsics, reach: float
+    ) -> Float64:
+        return self._registration.depth_differences(depth, intrinsics, PROBE, T_camera_object, reach, self._fixed)
+
+
+def _slid(T_camera_object: Float64, shift: float) -> Float64:
+    """A pose moved along the viewing ray of its centre by `shift` metres of depth."""
+    T = T_camera_object.copy()
+    T[:3, 3] *= (T[2, 3] + shift) / T[2, 3]
+    return T
 
 
 def _turned(T: Float64, axis: int, angle: float) -> Float64:
@@ -189,9 +227,21 @@ def _turned(T: Float64, axis: int, angle: float) -> Float64:
     return T @ turn
 
 
-def _mode(values: Float64, width: float) -> float:
-    """Mean of the values in the fullest window of the given width, metres."""
+def _modes(values: Float64, width: float, count: int) -> list[float]:
+    """Means of the values in the fullest windows of the given width, metres, the fullest first.
+
+    Windows do not overlap, and hold at least a fifth of what the first one holds, and 20 values.
+    """
     ordered = np.sort(values)
-    ends = np.searchsorted(ordered, ordered + width, side="right")
-    start = int(np.argmax(ends - np.arange(len(ordered))))
-    return float(np.mean(ordered[start : ends[start]]))
+    modes: list[float] = []
+    fullest = 0
+    while len(modes) < count and len(ordered) >= 20:
+        ends = np.searchsorted(ordered, ordered + width, side="right")
+        start = int(np.argmax(ends - np.arange(len(ordered))))
+        size = int(ends[start]) - start
+        fullest = max(fullest, size)
+        if size < max(20, 0.2 * fullest):
+            break
+        modes.append(float(np.mean(ordered[start : ends[start]])))
+        ordered = np.concatenate([ordered[:start], ordered[ends[start] :]])
+    return modes

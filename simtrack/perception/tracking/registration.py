@@ -230,15 +230,19 @@ class Registration:
         return batch.results()
 
     def depth_differences(
-        self, depth: Float32, intrinsics: CameraIntrinsics, instance: int, T_camera_object: Float64, reach: float
+        self,
+        depth: Float32,
+        intrinsics: CameraIntrinsics,
+        instance: int,
+        T_camera_object: Float64,
+        reach: float,
+        fixed: Mapping[int, Float64] | None = None,
     ) -> Float64:
-        """Measured minus model depth on the rays that hit a lone instance, metres, where within `reach`."""
-        for other in self._models:
-            self._scene.set_enabled(other, other == instance)
-        self._scene.set_pose(instance, T_camera_object)
-        window = self._window(instance, T_camera_object, intrinsics)
-        if window is None:
+        """Measured minus model depth on the rays that hit an instance first, metres, where within `reach`."""
+        if not self._place(intrinsics, {instance: T_camera_object}, fixed):
             return np.empty(0)
+        window = self._window(instance, T_camera_object, intrinsics)
+        assert window is not None
         hits, pixels = self._cast(intrinsics, [(window, self._stride(window))])
         out = np.empty(len(pixels))
         count = kernels.ray_differences(pixels, hits.distances, hits.instances, depth, instance, reach, out)

@@ -35,7 +35,7 @@ from simtrack.perception.tracking.association import (
     nearest_equivalent,
     rotation_apart,
 )
-from simtrack.perception.tracking.birth import FitConfig, Prober, believable, cost
+from simtrack.perception.tracking.birth import FitConfig, Occluders, Prober, believable, cost
 from simtrack.perception.tracking.filter import FilterConfig, Measurement, PoseFilter
 from simtrack.perception.tracking.registration import (
     Registration,
@@ -328,22 +328,23 @@ class ObjectTracker:
     def _contest(self, target: _Target, T_camera_object: Float64, group: list[PoseHypothesis], view: _View) -> None:
         """Let a detection's pose and the track's compete for the better fit to the depth image of its stamp."""
         model = self._tracked[target.model.name]
-        challenger = self._prober.best(group, model, view.depth, view.intrinsics)
+        around = self._around(view, but=target)
+        challenger = self._prober.best(group, model, view.depth, view.intrinsics, around)
         if challenger is None:
             return
-        holder = self._prober.judge(T_camera_object, model, view.depth, view.intrinsics)
+        holder = self._prober.judge(T_camera_object, model, view.depth, view.intrinsics, around)
         # The more often detections have contradicted a pose, the better it has to fit to stay.
         margin = 1.3 / max(1.0, 0.5 * target.disagreements)
         if holder is not None and cost(holder) < margin * cost(challenger):
             return
-        state = self._follow_up(target.model, challenger, view)
+        state = self._follow_up(target.model, challenger, view, but=target)
         if state is not None:
             target.filter, target.last_seen, target.disagreements = state, state.state.stamp, 0
 
     def _bear(self, group: list[PoseHypothesis], view: _View) -> None:
         """Make a detection that no track explains a track, if a registered hypothesis is believable."""
         model = self._models[group[0].class_name]
-        result = self._prober.best(group, self._tracked[model.name], view.depth, view.intrinsics)
+        result = self._prober.best(group, self._tracked[model.name], view.depth, view.intrinsics, self._around(view))
         if result is None:
             return
         T_map_object = view.T_map_camera @ result.T_camera_object
@@ -373,9 +374,21 @@ class ObjectTracker:
         target.residual, target.missing_since = result.residual, None
         self._registration.add(target.id, self._tracked[model.name])
 
+    def _around(self, view: _View, but: _Target | None = None) -> Occluders:
+        """The believed objects at a view's stamp: what may stand in front of a candidate."""
+        T_camera_map = inverse(view.T_map_camera)
+        return {
+            t.id: (self._tracked[t.model.name], T_camera_map @ t.filter.pose_at(view.stamp))
+            for t in self._targets
+            if t.status is TrackStatus.CONFIRMED and t is not but
+        }
+
     def _outdoes(self, result: RegistrationResult, other: _Target, T_camera_other: Float64, view: _View) -> bool:
         """Whether a candidate of another class explains a place clearly better than the track that holds it."""
-        holder = self._prober.judge(T_camera_other, self._tracked[other.model.name], view.depth, view.intrinsics)
+        around = self._around(view, but=other)
+        holder = self._prober.judge(
+            T_camera_other, self._tracked[other.model.name], view.depth, view.intrinsics, around
+        )
         if holder is None:
             return False
         established = 3.0 if other.status is not TrackStatus.TENTATIVE else 1.5
@@ -409,7 +422,9 @@ class ObjectTracker:
         target.status, target.born, target.detections, target.frames = TrackStatus.TENTATIVE, stamp, 1, 0
         return target
 
-    def _follow_up(self, model: ObjectModel, result: RegistrationResult, view: _View) -> PoseFilter | None:
+    def _follow_up(
+        self, model: ObjectModel, result: RegistrationResult, view: _View, but: _Target | None = None
+    ) -> PoseFilter | None:
         """Replay a registered candidate through the depth images since its own; None if it is lost on the way."""
         tracked = self._tracked[model.name]
         R = view.T_map_camera[:3, :3]
@@ -420,7 +435,8 @@ class ObjectTracker:
             if later.stamp <= view.stamp:
                 continue
             T = inverse(later.T_map_camera) @ state.predict(later.stamp).T_map_object
-            followed = self._prober.follow(T, tracked, later.depth, later.intrinsics)
+            around = self._around(later, but)
+            followed = self._prober.follow(T, tracked, later.depth, later.intrinsics, around)
             if followed is not None and believable(followed, self.config.fit):
                 state.update(self._measurement(later, followed, last))
                 last = later.stamp
