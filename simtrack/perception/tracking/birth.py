@@ -93,6 +93,7 @@ class Prober:
         self._coarse = [replace(step, repeats=1, coarsen=2) for step in schedule[:5]]
         self._refine = schedule[3:]
         self._follow = registration.track_schedule
+        self._narrow = [replace(step, repeats=2, coarsen=2) for step in registration.track_schedule]
         self._registration = Registration(probe)
         self._shown: dict[int, TrackedModel] = {}
         self._fixed: dict[int, Float64] = {}
@@ -127,12 +128,16 @@ class Prober:
     def _best_of(
         self, starts: Sequence[Float64], depth: Float32, intrinsics: CameraIntrinsics
     ) -> RegistrationResult | None:
-        """Register roughly from each start, and the best of them to the end."""
-        rough = [self._register(T, depth, intrinsics, self._coarse) for T in starts]
+        """Register roughly from each start, and the best of them to the end.
+
+        Wide gates reach far but take what touches the object for the object; narrow ones do not. Both are tried.
+        """
+        rough = [self._register(T, depth, intrinsics, steps) for T in starts for steps in (self._coarse, self._narrow)]
         found = min((r for r in rough if r is not None), key=cost, default=None)
         if found is None:
             return None
-        return self._register(found.T_camera_object, depth, intrinsics, self._refine)
+        settled = [self._register(found.T_camera_object, depth, intrinsics, s) for s in (self._refine, self._follow)]
+        return min((r for r in settled if r is not None), key=cost, default=None)
 
     def _register(
         self, T_camera_object: Float64, depth: Float32, intrinsics: CameraIntrinsics, schedule: Sequence[Step]
