@@ -36,6 +36,10 @@ class ExplorerConfig:
     """How long a patch has to be in view until it counts as explored, seconds."""
     view_distance: tuple[float, float] = (0.8, 1.8)
     """Distances from which a surface is looked at, metres."""
+    explore_distance: float = 2.2
+    """Largest distance from which an unexplored surface is looked at, metres."""
+    half_view: float = np.deg2rad(17.0)
+    """What lies within this angle of the camera's axis is in the image, radians."""
     reach: float = 2.6
     """Patches further than this from the camera are not seen well enough, metres."""
     max_linear: float = 0.9
@@ -115,13 +119,22 @@ class ExplorerAgent:
         reachable = [p for p in unexplored if (calm or p.entity in self._first) and self._worth(p, belief)]
         if reachable:
             entity = min(sorted({p.entity for p in reachable}), key=lambda e: self._cost(e, reachable, belief))
-            patch = min((p for p in reachable if p.entity == entity), key=lambda p: self._turn(p.centre, belief))
-            return entity, patch.centre
+            return entity, self._focus([p for p in reachable if p.entity == entity], belief)
         sought = self._search(belief)
         if sought:
             nearest = min(sought, key=lambda p: self._turn(p.centre, belief))
             return nearest.entity, nearest.centre
         return self._watch(belief)
+
+    def _focus(self, patches: list[Patch], belief: Belief) -> Float64:
+        """The middle of patches if they fit into one image, else the one that is nearest to the view."""
+        eye, middle = belief.T_map_camera[:3, 3], _middle(patches)
+        rays = np.array([p.centre - eye for p in patches])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        axis = (middle - eye) / np.linalg.norm(middle - eye)
+        if float(np.min(rays @ axis)) > np.cos(self.config.half_view):
+            return middle
+        return min(patches, key=lambda p: self._turn(p.centre, belief)).centre
 
     def _watch(self, belief: Belief) -> tuple[str, Float64 | None]:
         """Follow what moves; else look again at what was not looked at for long; else at where most objects are."""
@@ -188,27 +201,28 @@ class ExplorerAgent:
             return
         mine = [p for p in self._patches if p.entity == entity]
         here = belief.localization.T_map_base[:2, 3]
-        if not mine or self._sees_all(here, mine):
+        far = self.config.view_distance[1] if entity == self._home else self.config.explore_distance
+        if not mine or self._sees_all(here, mine, far):
             self._goal = _Viewpoint(entity, None)
             return
-        self._goal = _Viewpoint(entity, self._route(here, mine))
+        self._goal = _Viewpoint(entity, self._route(here, mine, far))
 
-    def _sees_all(self, place: Float64, patches: list[Patch]) -> bool:
-        near, far = self.config.view_distance
+    def _sees_all(self, place: Float64, patches: list[Patch], far: float) -> bool:
+        near = self.config.view_distance[0]
         offsets = np.array([place - p.centre[:2] for p in patches])
         distances = np.linalg.norm(offsets, axis=1)
         facing = np.einsum("ij,ij->i", offsets, np.array([p.front for p in patches])) / np.maximum(distances, 1e-9)
         return bool(distances.max() < far and distances.min() > 0.5 * near and facing.min() > 0.3)
 
-    def _route(self, here: Float64, patches: list[Patch]) -> Float64 | None:
+    def _route(self, here: Float64, patches: list[Patch], far: float) -> Float64 | None:
         """Shortest path (N, 2) to a free place from which all patches can be seen; None if there is none."""
         centre, front = _middle(patches)[:2], patches[0].front
         side = np.array([-front[1], front[0]])
         places = []
-        for distance in np.arange(self.config.view_distance[0] + 0.2, self.config.view_distance[1], 0.2):
+        for distance in np.arange(self.config.view_distance[0] + 0.2, far, 0.2):
             for angle in np.linspace(-1.0, 1.0, 9):
                 place = centre + distance * (np.cos(angle) * front + np.sin(angle) * side)
-                if self._plan.free(float(place[0]), float(place[1])) and self._sees_all(place, patches):
+                if self._plan.free(float(place[0]), float(place[1])) and self._sees_all(place, patches, far):
                     places.append(place)
         places.sort(key=lambda p: float(np.linalg.norm(p - here)))
         for place in places[:3]:
