@@ -26,7 +26,7 @@ class FitConfig:
 
     support: float = 0.8
     """Least share of its unoccluded rays that must confirm it."""
-    pixels: int = 150
+    pixels: int = 300
     """Fewest pixels that must confirm it."""
     occluded: float = 0.45
     """Largest share of its rays on which something may stand in front of it."""

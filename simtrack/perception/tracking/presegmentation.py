@@ -50,6 +50,9 @@ class PresegmentationConfig:
     the square of the distance)."""
     min_pixels: int = 60
     """Smaller camera clusters are noise."""
+    growth: int = 12
+    """Clusters take in doubtful pixels (explained, but not closely) up to this many pixels around them: the lower rim
+    of a thing that stands on a surface."""
     lidar_join: float = 0.25
     """Lidar points nearer than this belong to one cluster, metres."""
     min_points: int = 4
@@ -89,15 +92,18 @@ def presegment_camera(
     hits = scene.cast(bundle, T_map_camera)
     camera = np.array([K.fx, K.fy, K.cx, K.cy])
     normals = hits.normals @ T_map_camera[:3, :3].astype(np.float32)
-    unknown = np.zeros(depth.shape, bool)
+    unknown, doubtful = np.zeros(depth.shape, bool), np.zeros(depth.shape, bool)
     _unexplained_pixels(
         depth, hits.distances.reshape(bundle.shape), normals.reshape(*bundle.shape, 3), camera, config.stride,
-        config.map_sigma, config.tolerance, config.focal_baseline, unknown,
+        config.map_sigma, config.tolerance, config.focal_baseline, unknown, doubtful,
     )  # fmt: skip
     unknown &= near
+    doubtful &= near
     if own_body is not None:
         unknown &= ~own_body
+        doubtful &= ~own_body
     labels, count = _label_pixels(unknown, depth, config.join, config.min_pixels)
+    _grow(labels, doubtful, depth, config.join, config.growth)
     regions = _camera_regions(labels, count, depth, K, T_map_camera, frame.stamp)
     return Presegmentation(frame.stamp, unknown, valid, labels, regions, "camera")
 
@@ -165,9 +171,12 @@ def shot_rays(scan: LidarScan, pose_at: Callable[[int], Float64]) -> tuple[Float
 
 @njit(cache=True, nogil=True)
 def _unexplained_pixels(
-    depth, model_depth, normals, camera, stride, map_sigma, tolerance, focal_baseline, unknown
+    depth, model_depth, normals, camera, stride, map_sigma, tolerance, focal_baseline, unknown, doubtful
 ):  # fmt: skip
-    """Mark (H, W) readings further from the tangent planes of nearby model points than sensor, map and pose allow."""
+    """Mark (H, W) readings further from the tangent planes of nearby model points than sensor, map and pose allow.
+
+    `doubtful` are those that are explained, but not closely, and the unknown ones.
+    """
     height, width = depth.shape
     rows, columns = model_depth.shape
     for v in range(height):
@@ -179,13 +188,14 @@ def _unexplained_pixels(
             variance = axial_variance(d, 0.9, focal_baseline)
             sigma = np.sqrt(variance)
             limit = min(3.0 * np.sqrt(variance + map_sigma * map_sigma), 2.5 * sigma + tolerance)
-            lateral = 3.0 * stride * d / camera[0] + limit
+            lateral = 2.0 * stride * d / camera[0] + 0.5 * limit
             row, column = v // stride, u // stride
-            explained = False
+            doubt = min(limit, sigma + 0.5 * tolerance)
+            nearest = 1e9
             for ring in range(3):  # the pixel's own ray first: it explains nearly all
                 for b in range(-ring, ring + 1):
                     for a in range(-ring, ring + 1):
-                        if explained or max(abs(a), abs(b)) != ring:
+                        if nearest < doubt or max(abs(a), abs(b)) != ring:
                             continue
                         i, j = row + b, column + a
                         if i < 0 or j < 0 or i >= rows or j >= columns:
@@ -198,10 +208,11 @@ def _unexplained_pixels(
                         ez = d - z
                         off = abs(ex * normals[i, j, 0] + ey * normals[i, j, 1] + ez * normals[i, j, 2])
                         if off < limit and ex * ex + ey * ey + ez * ez < lateral * lateral + 25.0 * off * off:
-                            explained = True
-                if explained:
+                            nearest = min(nearest, off)
+                if nearest < doubt:
                     break
-            unknown[v, u] = not explained
+            unknown[v, u] = nearest >= limit
+            doubtful[v, u] = nearest >= doubt
 
 
 @njit(cache=True, nogil=True)
@@ -243,6 +254,35 @@ def _label_pixels(unknown, depth, join, min_pixels):
         for u in range(width):
             labels[v, u] = max(labels[v, u], 0)
     return labels, count
+
+
+@njit(cache=True, nogil=True)
+def _grow(labels, doubtful, depth, join, steps):
+    """Let clusters take in doubtful pixels that touch them without a depth step, pixel ring by pixel ring."""
+    height, width = labels.shape
+    front = np.empty(height * width, np.int32)
+    count = 0
+    for v in range(height):
+        for u in range(width):
+            if labels[v, u] > 0:
+                front[count] = v * width + u
+                count += 1
+    start = 0
+    for _ in range(steps):
+        end = count
+        for k in range(start, end):
+            v, u = front[k] // width, front[k] % width
+            d = depth[v, u]
+            for b in range(-1, 2):
+                for a in range(-1, 2):
+                    y, x = v + b, u + a
+                    if y < 0 or x < 0 or y >= height or x >= width or labels[y, x] != 0 or not doubtful[y, x]:
+                        continue
+                    if depth[y, x] > 0.0 and abs(depth[y, x] - d) < join * max(d * d, 1.0):
+                        labels[y, x] = labels[v, u]
+                        front[count] = y * width + x
+                        count += 1
+        start = end
 
 
 def _camera_regions(

@@ -30,7 +30,7 @@ class ExplorerConfig:
     """Map entities on which objects are sought first."""
     further_classes: tuple[str, ...] = ("table", "desk", "cart")
     """Map entities on which objects are sought when nothing has moved for a while."""
-    calm: float = 15.0
+    calm: float = 30.0
     """How long that is, seconds."""
     dwell: float = 0.9
     """How long a patch has to be in view until it counts as explored, seconds."""
@@ -49,7 +49,9 @@ class ExplorerConfig:
     memory: float = 30.0
     """A surface with tracks on it that has not been looked at for this long is looked at again, seconds."""
     search_time: float = 8.0
-    """A lost object is sought for this long, seconds."""
+    """A lost object is sought for this long, seconds ..."""
+    search_radius: float = 1.5
+    """... this far around where it was, metres."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.view_distance[0] < self.view_distance[1]:
@@ -76,7 +78,7 @@ class ExplorerAgent:
         self._posture = start
         self._stamp = -1
         self._goal: _Viewpoint | None = None
-        self._lost_at: dict[int, int] = {}
+        self._lost_at: dict[int, tuple[int, Float64]] = {}
         self._home: str | None = None
 
     def act(self, belief: Belief, joints: JointState) -> Command:
@@ -104,7 +106,7 @@ class ExplorerAgent:
             if track.moving:
                 self._last_motion = belief.stamp
             if track.status is TrackStatus.LOST:
-                self._lost_at.setdefault(track.id, belief.stamp)
+                self._lost_at.setdefault(track.id, (belief.stamp, track.T_map_object[:3, 3]))
             else:
                 self._lost_at.pop(track.id, None)
         if self._home is None:
@@ -155,10 +157,14 @@ class ExplorerAgent:
         return home[0].entity, 0.5 * centre + 0.5 * self._near(centre, belief.tracks)
 
     def _search(self, belief: Belief) -> list[Patch]:
-        """Patches that have not been seen since an object was lost."""
-        patience = self.config.search_time * NANOSECONDS
-        losses = [stamp for stamp in self._lost_at.values() if belief.stamp - stamp < patience]
-        return [p for p in self._patches if losses and p.last_seen < max(losses) and self._worth(p, belief)]
+        """Patches around the places of lost objects that have not been seen since the loss."""
+        patience, reach = self.config.search_time * NANOSECONDS, self.config.search_radius
+        losses = [(stamp, place) for stamp, place in self._lost_at.values() if belief.stamp - stamp < patience]
+        return [
+            p
+            for p in self._patches
+            if any(p.last_seen < stamp and np.linalg.norm(p.centre - place) < reach for stamp, place in losses)
+        ]
 
     def _worth(self, patch: Patch, belief: Belief) -> bool:
         """Whether a patch lies near enough for the trip to pay."""
