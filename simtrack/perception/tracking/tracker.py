@@ -77,6 +77,12 @@ class TrackerConfig:
     """... with less support than this ..."""
     doubtful_misfit: float = 0.85
     """... or a larger misfit than this."""
+    beside: float = 0.2
+    """Detections that lie further beside a track than this share of its diameter disagree with it, too."""
+    demote_after: int = 3
+    """So many detections in a row that disagree end the belief in a track that is vague:"""
+    vague_rotation: float = np.deg2rad(1.2)
+    """one whose orientation the depth image determines no better than this, radians."""
     shared_surface: float = 0.4
     """Two objects cannot both be there if they explain more than this share of the same measurements."""
     localization_correlation: float = 0.3
@@ -297,7 +303,8 @@ class ObjectTracker:
         apart = [rotation_apart(h.T_camera_object, T_camera_object, target.model) for h in group]
         nearest = group[int(np.argmin(apart))]
         limit = self.config.doubt if self._doubtful(target) else self.config.disagreement
-        if min(apart) <= limit:
+        beside = _beside(nearest.T_camera_object, T_camera_object) > self.config.beside * target.model.diameter
+        if min(apart) <= limit and not beside:
             target.disagreements = 0
             target.detections += 1
             target.score = min(0.99, target.score + 0.1)
@@ -307,6 +314,17 @@ class ObjectTracker:
         unsettled = target.status is TrackStatus.TENTATIVE or view.stamp > target.last_seen or self._doubtful(target)
         if unsettled or target.disagreements >= 2:
             self._contest(target, T_camera_object, group, view)
+        if target.disagreements >= self.config.demote_after and self._vague(target):
+            # Detections say again and again that it is otherwise, and the depth image cannot tell: no knowledge.
+            target.status, target.born = TrackStatus.TENTATIVE, self._views[-1].stamp
+            target.detections, target.disagreements = 0, 0
+
+    def _vague(self, target: _Target) -> bool:
+        """Whether the depth image determines a track's orientation too poorly to outweigh detections."""
+        if target.result is None:
+            return True
+        variances = np.linalg.eigvalsh(target.result.covariance[3:, 3:])
+        return bool(variances[-1] > self.config.vague_rotation**2)
 
     def _doubtful(self, target: _Target) -> bool:
         """Whether a track's last registration may have slid into a wrong minimum."""
@@ -480,6 +498,12 @@ def tracked_model(model: ObjectModel) -> TrackedModel:
     return TrackedModel(
         TriangleMesh(model.mesh.vertices, model.mesh.faces), corners, 0.5 * float(np.linalg.norm(model.extents))
     )
+
+
+def _beside(T_a: Float64, T_b: Float64) -> float:
+    """How far one pose lies beside another as the camera sees it, metres at the depth of the second."""
+    a, b = T_a[:3, 3], T_b[:3, 3]
+    return float(np.linalg.norm(a[:2] / a[2] - b[:2] / b[2]) * b[2])
 
 
 def camera_error_at(view: _View, T_map_object: Float64) -> Float64:
