@@ -40,7 +40,7 @@ class RegistrationFromTruth:
     def __init__(self, models: "Mapping[str, ObjectModel]", config: "RegistrationConfig | None" = None) -> None:
         """`models`: class name -> the tracker's model."""
         from simtrack.perception.tracking.registration import Registration
-        from simtrack.perception.tracking.tracker import tracked_model
+        from simtrack.perception.tracking.target import tracked_model
 
         self._registration = Registration(config)
         self._models = {name: tracked_model(model) for name, model in models.items()}

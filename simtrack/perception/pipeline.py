@@ -47,7 +47,8 @@ from simtrack.perception.tracking.presegmentation import (
     presegment_camera,
     presegment_lidar,
 )
-from simtrack.perception.tracking.tracker import ObjectTracker, TrackerConfig
+from simtrack.perception.tracking.target import TrackerConfig
+from simtrack.perception.tracking.tracker import ObjectTracker
 
 T = TypeVar("T")
 

@@ -8,14 +8,11 @@ late; they are matched, born and fused at the stamp of their image and replayed 
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from simtrack.contracts import (
     NANOSECONDS,
-    CameraIntrinsics,
-    Float32,
     Float64,
     PoseHypothesis,
     RgbdFrame,
@@ -25,7 +22,7 @@ from simtrack.contracts import (
     TrackStatus,
 )
 from simtrack.errors import UnknownNameError
-from simtrack.geometry.transforms import inverse, rotate_covariance, skew
+from simtrack.geometry.transforms import inverse, rotate_covariance
 from simtrack.objects import ObjectModel
 from simtrack.perception.tracking.association import (
     assign,
@@ -35,100 +32,18 @@ from simtrack.perception.tracking.association import (
     nearest_equivalent,
     rotation_apart,
 )
-from simtrack.perception.tracking.birth import FitConfig, Occluders, Prober, believable, cost
-from simtrack.perception.tracking.filter import FilterConfig, Measurement, PoseFilter
-from simtrack.perception.tracking.registration import (
-    Registration,
-    RegistrationConfig,
-    RegistrationResult,
-    TrackedModel,
+from simtrack.perception.tracking.birth import Occluders, Prober, believable, cost
+from simtrack.perception.tracking.filter import Measurement, PoseFilter
+from simtrack.perception.tracking.registration import Registration, RegistrationResult
+from simtrack.perception.tracking.target import (
+    Target,
+    TrackerConfig,
+    View,
+    beside,
+    camera_error_at,
+    share_in_image,
+    tracked_model,
 )
-from simtrack.raycast import TriangleMesh
-
-
-@dataclass(frozen=True, slots=True)
-class TrackerConfig:
-    """Settings of `ObjectTracker`."""
-
-    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
-    filter: FilterConfig = field(default_factory=FilterConfig)
-    fit: FitConfig = field(default_factory=FitConfig)
-    buffer: float = 0.5
-    """Depth images are kept this long for late detections, seconds."""
-    confirm_detections: int = 2
-    """Detections that a new object needs before it is believed."""
-    confirm_frames: int = 3
-    """Registered frames that a new object needs before it is believed."""
-    tentative_timeout: float = 1.2
-    """A new object that is not confirmed within this time is dropped, seconds."""
-    lost_after: float = 0.25
-    """An object that should be visible and is not is lost after this time, seconds."""
-    keep_support: float = 0.4
-    """Least share of unoccluded rays that must confirm a track for its registration to count."""
-    min_rays: int = 16
-    """Fewest confirming rays for a registration to count."""
-    max_jump: float = 0.08
-    """A registration that moves a track further than this from its prediction, metres, is not believed."""
-    disagreement: float = np.deg2rad(25.0)
-    """Detections that differ from a registered track by more than this put its orientation to the test, radians."""
-    doubt: float = np.deg2rad(14.0)
-    """... or by more than this, if its fit is doubtful ..."""
-    doubtful_support: float = 0.95
-    """... with less support than this ..."""
-    doubtful_misfit: float = 0.85
-    """... or a larger misfit than this."""
-    beside: float = 0.2
-    """Detections that lie further beside a track than this share of its diameter disagree with it, too."""
-    demote_after: int = 3
-    """So many detections in a row that disagree end the belief in a track that is vague:"""
-    vague_rotation: float = np.deg2rad(1.2)
-    """one whose orientation the depth image determines no better than this, radians."""
-    shared_surface: float = 0.4
-    """Two objects cannot both be there if they explain more than this share of the same measurements."""
-    localization_correlation: float = 0.3
-    """Time over which errors of the robot's pose are correlated, seconds."""
-    same_object_speed: float = 0.7
-    """An object of the same class that appears within reach of one that was being moved is that one, m/s."""
-    same_object_memory: float = 4.0
-    """... if that one was last seen at most this long ago, seconds."""
-
-
-@dataclass(slots=True)
-class _View:
-    """A depth image with the camera's pose at its stamp."""
-
-    stamp: int
-    depth: Float32
-    intrinsics: CameraIntrinsics
-    T_map_camera: Float64
-    covariance: Float64
-
-
-@dataclass(slots=True)
-class _Target:
-    """All that is kept of one object."""
-
-    id: int
-    model: ObjectModel
-    filter: PoseFilter
-    born: int
-    status: TrackStatus = TrackStatus.TENTATIVE
-    detections: int = 1
-    frames: int = 0
-    last_seen: int = 0
-    missing_since: int | None = None
-    disagreements: int = 0
-    moved_when_seen: bool = False
-    known: bool = False
-    """It was believed once: its identity is kept for when it turns up again."""
-    score: float = 0.5
-    visible_fraction: float = 0.0
-    residual: float = 0.0
-    result: RegistrationResult | None = None
-
-    @property
-    def alive(self) -> bool:
-        return self.status is not TrackStatus.LOST
 
 
 class ObjectTracker:
@@ -146,9 +61,9 @@ class ObjectTracker:
         self._tracked = {name: tracked_model(model) for name, model in self._models.items()}
         self._registration = Registration(self.config.registration)
         self._prober = Prober(self.config.registration, self.config.fit)
-        self._targets: list[_Target] = []
+        self._targets: list[Target] = []
         self._next_id = 1
-        self._views: deque[_View] = deque()
+        self._views: deque[View] = deque()
 
     def close(self) -> None:
         """Release the scenes' memory."""
@@ -182,7 +97,7 @@ class ObjectTracker:
         if self._views and frame.stamp <= self._views[-1].stamp:
             return TrackerResult(frame.stamp, self._tracks(self._views[-1]), Status.STALE)
         depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0.0), frame.depth, np.float32(0.0))
-        view = _View(frame.stamp, depth.astype(np.float32), frame.intrinsics, T_map_camera, covariance)
+        view = View(frame.stamp, depth.astype(np.float32), frame.intrinsics, T_map_camera, covariance)
         self._views.append(view)
         while view.stamp - self._views[0].stamp > self.config.buffer * NANOSECONDS:
             self._views.popleft()
@@ -192,7 +107,7 @@ class ObjectTracker:
         self._prune(view.stamp)
         return TrackerResult(frame.stamp, self._tracks(view), status)
 
-    def _register(self, view: _View) -> None:
+    def _register(self, view: View) -> None:
         """Register all living targets to a view and judge each."""
         T_camera_map = inverse(view.T_map_camera)
         living = [t for t in self._targets if t.alive]
@@ -204,11 +119,11 @@ class ObjectTracker:
         for target in living:
             self._judge(target, view, poses[target.id], results.get(target.id))
 
-    def _judge(self, target: _Target, view: _View, T_predicted: Float64, result: RegistrationResult | None) -> None:
+    def _judge(self, target: Target, view: View, T_predicted: Float64, result: RegistrationResult | None) -> None:
         """What one registration says of a target: seen, occluded, out of view or missing."""
         config = self.config
         target.result = result
-        inside = _share_in_image(target.model, T_predicted, view.intrinsics)
+        inside = share_in_image(target.model, T_predicted, view.intrinsics)
         if result is None or result.rays < config.min_rays:
             target.filter.skip(view.stamp)
             target.visible_fraction, target.missing_since = 0.0, None
@@ -236,7 +151,7 @@ class ObjectTracker:
         if target.status is not TrackStatus.TENTATIVE:
             target.status = TrackStatus.OCCLUDED if inside > 0.3 else TrackStatus.OUT_OF_VIEW
 
-    def _measure(self, target: _Target, view: _View, result: RegistrationResult) -> None:
+    def _measure(self, target: Target, view: View, result: RegistrationResult) -> None:
         """Fuse an accepted registration."""
         target.filter.update(self._measurement(view, result, target.last_seen))
         target.frames += 1
@@ -249,7 +164,7 @@ class ObjectTracker:
         if enough or target.status is not TrackStatus.TENTATIVE:
             target.status, target.known = TrackStatus.CONFIRMED, True
 
-    def _measurement(self, view: _View, result: RegistrationResult, last_seen: int) -> Measurement:
+    def _measurement(self, view: View, result: RegistrationResult, last_seen: int) -> Measurement:
         """A registration in the map frame; the camera's own error wanders, correlated over time."""
         R = view.T_map_camera[:3, :3]
         elapsed = max(view.stamp - last_seen, 0) / NANOSECONDS
@@ -259,7 +174,7 @@ class ObjectTracker:
             view.stamp, view.T_map_camera @ result.T_camera_object, rotate_covariance(R, result.covariance), drift
         )
 
-    def _lose(self, target: _Target) -> None:
+    def _lose(self, target: Target) -> None:
         """Take a target out of the scene; its identity is kept for when the object turns up again."""
         if not target.known:
             self._targets.remove(target)
@@ -298,13 +213,13 @@ class ObjectTracker:
                 else:
                     self._bear(group, view)
 
-    def _confirm(self, target: _Target, T_camera_object: Float64, group: list[PoseHypothesis], view: _View) -> None:
+    def _confirm(self, target: Target, T_camera_object: Float64, group: list[PoseHypothesis], view: View) -> None:
         """Take a detection of a tracked object: fuse it, or let it contest an orientation that it disagrees with."""
         apart = [rotation_apart(h.T_camera_object, T_camera_object, target.model) for h in group]
         nearest = group[int(np.argmin(apart))]
         limit = self.config.doubt if self._doubtful(target) else self.config.disagreement
-        beside = _beside(nearest.T_camera_object, T_camera_object) > self.config.beside * target.model.diameter
-        if min(apart) <= limit and not beside:
+        aside = beside(nearest.T_camera_object, T_camera_object) > self.config.beside * target.model.diameter
+        if min(apart) <= limit and not aside:
             target.disagreements = 0
             target.detections += 1
             target.score = min(0.99, target.score + 0.1)
@@ -319,21 +234,21 @@ class ObjectTracker:
             target.status, target.born = TrackStatus.TENTATIVE, self._views[-1].stamp
             target.detections, target.disagreements = 0, 0
 
-    def _vague(self, target: _Target) -> bool:
+    def _vague(self, target: Target) -> bool:
         """Whether the depth image determines a track's orientation too poorly to outweigh detections."""
         if target.result is None:
             return True
         variances = np.linalg.eigvalsh(target.result.covariance[3:, 3:])
         return bool(variances[-1] > self.config.vague_rotation**2)
 
-    def _doubtful(self, target: _Target) -> bool:
+    def _doubtful(self, target: Target) -> bool:
         """Whether a track's last registration may have slid into a wrong minimum."""
         result = target.result
         return result is not None and (
             result.support < self.config.doubtful_support or result.misfit > self.config.doubtful_misfit
         )
 
-    def _fuse_late(self, target: _Target, T_camera_object: Float64, h: PoseHypothesis, view: _View) -> None:
+    def _fuse_late(self, target: Target, T_camera_object: Float64, h: PoseHypothesis, view: View) -> None:
         """Fuse a detection's pose at its own stamp, unless it lies outside of its own error bounds."""
         T = nearest_equivalent(h.T_camera_object, T_camera_object, target.model)
         R = view.T_map_camera[:3, :3]
@@ -343,7 +258,7 @@ class ObjectTracker:
                 Measurement(view.stamp, view.T_map_camera @ T, rotate_covariance(R, h.covariance), np.zeros((6, 6)))
             )
 
-    def _contest(self, target: _Target, T_camera_object: Float64, group: list[PoseHypothesis], view: _View) -> None:
+    def _contest(self, target: Target, T_camera_object: Float64, group: list[PoseHypothesis], view: View) -> None:
         """Let a detection's pose and the track's compete for the better fit to the depth image of its stamp."""
         model = self._tracked[target.model.name]
         around = self._around(view, but=target)
@@ -359,7 +274,7 @@ class ObjectTracker:
         if state is not None:
             target.filter, target.last_seen, target.disagreements = state, state.state.stamp, 0
 
-    def _bear(self, group: list[PoseHypothesis], view: _View) -> None:
+    def _bear(self, group: list[PoseHypothesis], view: View) -> None:
         """Make a detection that no track explains a track, if a registered hypothesis is believable."""
         model = self._models[group[0].class_name]
         result = self._prober.best(group, self._tracked[model.name], view.depth, view.intrinsics, self._around(view))
@@ -392,7 +307,7 @@ class ObjectTracker:
         target.residual, target.missing_since = result.residual, None
         self._registration.add(target.id, self._tracked[model.name])
 
-    def _around(self, view: _View, but: _Target | None = None) -> Occluders:
+    def _around(self, view: View, but: Target | None = None) -> Occluders:
         """The believed objects at a view's stamp: what may stand in front of a candidate."""
         T_camera_map = inverse(view.T_map_camera)
         return {
@@ -401,7 +316,7 @@ class ObjectTracker:
             if t.status is TrackStatus.CONFIRMED and t is not but
         }
 
-    def _outdoes(self, result: RegistrationResult, other: _Target, T_camera_other: Float64, view: _View) -> bool:
+    def _outdoes(self, result: RegistrationResult, other: Target, T_camera_other: Float64, view: View) -> bool:
         """Whether a candidate of another class explains a place clearly better than the track that holds it."""
         around = self._around(view, but=other)
         holder = self._prober.judge(
@@ -412,13 +327,13 @@ class ObjectTracker:
         established = 3.0 if other.status is not TrackStatus.TENTATIVE else 1.5
         return cost(result) * established < cost(holder)
 
-    def _newcomer(self, model: ObjectModel, followed: PoseFilter, view: _View) -> _Target:
-        target = _Target(self._next_id, model, followed, born=view.stamp)
+    def _newcomer(self, model: ObjectModel, followed: PoseFilter, view: View) -> Target:
+        target = Target(self._next_id, model, followed, born=view.stamp)
         self._next_id += 1
         self._targets.append(target)
         return target
 
-    def _known_before(self, model: ObjectModel, followed: PoseFilter) -> _Target | None:
+    def _known_before(self, model: ObjectModel, followed: PoseFilter) -> Target | None:
         """The target that a reappearing object is: a lost one, or one that was being moved when last seen."""
         lost = [t for t in self._targets if not t.alive and t.model is model]
         if lost:
@@ -435,13 +350,13 @@ class ObjectTracker:
         return None
 
     @staticmethod
-    def _revive(target: _Target, stamp: int) -> _Target:
+    def _revive(target: Target, stamp: int) -> Target:
         """A known object has turned up again: it keeps its identity and is believed after another detection."""
         target.status, target.born, target.detections, target.frames = TrackStatus.TENTATIVE, stamp, 1, 0
         return target
 
     def _follow_up(
-        self, model: ObjectModel, result: RegistrationResult, view: _View, but: _Target | None = None
+        self, model: ObjectModel, result: RegistrationResult, view: View, but: Target | None = None
     ) -> PoseFilter | None:
         """Replay a registered candidate through the depth images since its own; None if it is lost on the way."""
         tracked = self._tracked[model.name]
@@ -465,7 +380,7 @@ class ObjectTracker:
 
     # ---------------------------------------------------------------------------------------------------------- results
 
-    def _tracks(self, view: _View) -> tuple[Track, ...]:
+    def _tracks(self, view: View) -> tuple[Track, ...]:
         T_camera_map = inverse(view.T_map_camera)
         tracks = []
         for t in self._targets:
@@ -490,37 +405,3 @@ class ObjectTracker:
                 )
             )
         return tuple(tracks)
-
-
-def tracked_model(model: ObjectModel) -> TrackedModel:
-    """What the registration needs of an object model."""
-    corners = model.keypoints[:8]
-    return TrackedModel(
-        TriangleMesh(model.mesh.vertices, model.mesh.faces), corners, 0.5 * float(np.linalg.norm(model.extents))
-    )
-
-
-def _beside(T_a: Float64, T_b: Float64) -> float:
-    """How far one pose lies beside another as the camera sees it, metres at the depth of the second."""
-    a, b = T_a[:3, 3], T_b[:3, 3]
-    return float(np.linalg.norm(a[:2] / a[2] - b[:2] / b[2]) * b[2])
-
-
-def camera_error_at(view: _View, T_map_object: Float64) -> Float64:
-    """(6, 6) covariance that an uncertain camera pose adds to an object's pose in the map, lever arm included."""
-    J = np.eye(6)
-    J[:3, 3:] = -skew(T_map_object[:3, 3] - view.T_map_camera[:3, 3])
-    return J @ view.covariance @ J.T
-
-
-def _share_in_image(model: ObjectModel, T_camera_object: Float64, intrinsics: CameraIntrinsics) -> float:
-    """Share of the projected box's bounding rectangle that lies inside the image."""
-    p = model.keypoints[:8] @ T_camera_object[:3, :3].T + T_camera_object[:3, 3]
-    if p[:, 2].min() < 0.05:
-        return 0.0
-    u = intrinsics.fx * p[:, 0] / p[:, 2] + intrinsics.cx
-    v = intrinsics.fy * p[:, 1] / p[:, 2] + intrinsics.cy
-    width, height = float(np.ptp(u)), float(np.ptp(v))
-    inside_u = max(0.0, min(float(u.max()), intrinsics.width - 0.5) - max(float(u.min()), -0.5))
-    inside_v = max(0.0, min(float(v.max()), intrinsics.height - 0.5) - max(float(v.min()), -0.5))
-    return inside_u * inside_v / max(width * height, 1e-9)

@@ -8,7 +8,7 @@ from simtrack.contracts import CameraIntrinsics, Float32, Float64, RgbdFrame
 from simtrack.geometry.transforms import inverse, look_at, perturb, transform_xyz_rpy
 from simtrack.objects import ObjectModel, load_object
 from simtrack.perception.tracking.registration import Registration, RegistrationConfig
-from simtrack.perception.tracking.tracker import tracked_model
+from simtrack.perception.tracking.target import tracked_model
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 
 INTRINSICS = CameraIntrinsics(320, 240, 288.5, 288.5, 159.5, 119.5)

@@ -9,7 +9,7 @@ from simtrack.geometry.transforms import angle_between
 from simtrack.objects import load_object
 from simtrack.perception.tracking.association import nearest_equivalent
 from simtrack.perception.tracking.registration import Registration, RegistrationConfig, Step
-from simtrack.perception.tracking.tracker import tracked_model
+from simtrack.perception.tracking.target import tracked_model
 from simtrack.sensors.depth_noise import PRESETS, apply_depth_noise
 
 spec = importlib.util.spec_from_file_location("bench_scenes", Path(__file__).with_name("scenes.py"))

@@ -1,0 +1,133 @@
+"""What the tracker keeps of an object and of a depth image, and its settings."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from simtrack.contracts import CameraIntrinsics, Float32, Float64, TrackStatus
+from simtrack.geometry.transforms import skew
+from simtrack.objects import ObjectModel
+from simtrack.perception.tracking.birth import FitConfig
+from simtrack.perception.tracking.filter import FilterConfig, PoseFilter
+from simtrack.perception.tracking.registration import RegistrationConfig, RegistrationResult, TrackedModel
+from simtrack.raycast import TriangleMesh
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerConfig:
+    """Settings of `ObjectTracker`."""
+
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    filter: FilterConfig = field(default_factory=FilterConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    buffer: float = 0.5
+    """Depth images are kept this long for late detections, seconds."""
+    confirm_detections: int = 2
+    """Detections that a new object needs before it is believed."""
+    confirm_frames: int = 3
+    """Registered frames that a new object needs before it is believed."""
+    tentative_timeout: float = 1.2
+    """A new object that is not confirmed within this time is dropped, seconds."""
+    lost_after: float = 0.25
+    """An object that should be visible and is not is lost after this time, seconds."""
+    keep_support: float = 0.4
+    """Least share of unoccluded rays that must confirm a track for its registration to count."""
+    min_rays: int = 16
+    """Fewest confirming rays for a registration to count."""
+    max_jump: float = 0.08
+    """A registration that moves a track further than this from its prediction, metres, is not believed."""
+    disagreement: float = np.deg2rad(25.0)
+    """Detections that differ from a registered track by more than this put its orientation to the test, radians."""
+    doubt: float = np.deg2rad(14.0)
+    """... or by more than this, if its fit is doubtful ..."""
+    doubtful_support: float = 0.95
+    """... with less support than this ..."""
+    doubtful_misfit: float = 0.85
+    """... or a larger misfit than this."""
+    beside: float = 0.2
+    """Detections that lie further beside a track than this share of its diameter disagree with it, too."""
+    demote_after: int = 3
+    """So many detections in a row that disagree end the belief in a track that is vague:"""
+    vague_rotation: float = np.deg2rad(1.2)
+    """one whose orientation the depth image determines no better than this, radians."""
+    shared_surface: float = 0.4
+    """Two objects cannot both be there if they explain more than this share of the same measurements."""
+    localization_correlation: float = 0.3
+    """Time over which errors of the robot's pose are correlated, seconds."""
+    same_object_speed: float = 0.7
+    """An object of the same class that appears within reach of one that was being moved is that one, m/s."""
+    same_object_memory: float = 4.0
+    """... if that one was last seen at most this long ago, seconds."""
+
+
+@dataclass(slots=True)
+class View:
+    """A depth image with the camera's pose at its stamp."""
+
+    stamp: int
+    depth: Float32
+    intrinsics: CameraIntrinsics
+    T_map_camera: Float64
+    covariance: Float64
+
+
+@dataclass(slots=True)
+class Target:
+    """All that is kept of one object."""
+
+    id: int
+    model: ObjectModel
+    filter: PoseFilter
+    born: int
+    status: TrackStatus = TrackStatus.TENTATIVE
+    detections: int = 1
+    frames: int = 0
+    last_seen: int = 0
+    missing_since: int | None = None
+    disagreements: int = 0
+    moved_when_seen: bool = False
+    known: bool = False
+    """It was believed once: its identity is kept for when it turns up again."""
+    score: float = 0.5
+    visible_fraction: float = 0.0
+    residual: float = 0.0
+    result: RegistrationResult | None = None
+
+    @property
+    def alive(self) -> bool:
+        """Whether it takes part in registration."""
+        return self.status is not TrackStatus.LOST
+
+
+def tracked_model(model: ObjectModel) -> TrackedModel:
+    """What the registration needs of an object model."""
+    corners = model.keypoints[:8]
+    return TrackedModel(
+        TriangleMesh(model.mesh.vertices, model.mesh.faces), corners, 0.5 * float(np.linalg.norm(model.extents))
+    )
+
+
+def beside(T_a: Float64, T_b: Float64) -> float:
+    """How far one pose lies beside another as the camera sees it, metres at the depth of the second."""
+    a, b = T_a[:3, 3], T_b[:3, 3]
+    return float(np.linalg.norm(a[:2] / a[2] - b[:2] / b[2]) * b[2])
+
+
+def camera_error_at(view: View, T_map_object: Float64) -> Float64:
+    """(6, 6) covariance that an uncertain camera pose adds to an object's pose in the map, lever arm included."""
+    J = np.eye(6)
+    J[:3, 3:] = -skew(T_map_object[:3, 3] - view.T_map_camera[:3, 3])
+    return J @ view.covariance @ J.T
+
+
+def share_in_image(model: ObjectModel, T_camera_object: Float64, intrinsics: CameraIntrinsics) -> float:
+    """Share of the projected box's bounding rectangle that lies inside the image."""
+    p = model.keypoints[:8] @ T_camera_object[:3, :3].T + T_camera_object[:3, 3]
+    if p[:, 2].min() < 0.05:
+        return 0.0
+    u = intrinsics.fx * p[:, 0] / p[:, 2] + intrinsics.cx
+    v = intrinsics.fy * p[:, 1] / p[:, 2] + intrinsics.cy
+    width, height = float(np.ptp(u)), float(np.ptp(v))
+    inside_u = max(0.0, min(float(u.max()), intrinsics.width - 0.5) - max(float(u.min()), -0.5))
+    inside_v = max(0.0, min(float(v.max()), intrinsics.height - 0.5) - max(float(v.min()), -0.5))
+    return inside_u * inside_v / max(width * height, 1e-9)
