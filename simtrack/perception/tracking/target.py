@@ -50,6 +50,10 @@ class TrackerConfig:
     """So many detections in a row that disagree end the belief in a track that is vague:"""
     vague_rotation: float = np.deg2rad(1.2)
     """one whose orientation the depth image determines no better than this, radians."""
+    unseen_gap: float = 0.5
+    """An object that was not seen for this long, seconds ..."""
+    displaced: float = 0.015
+    """... and then stands further than this from where it was, metres, has been moved; if vague, it is not believed."""
     shared_surface: float = 0.4
     """Two objects cannot both be there if they explain more than this share of the same measurements."""
     localization_correlation: float = 0.3

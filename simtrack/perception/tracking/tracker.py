@@ -135,7 +135,7 @@ class ObjectTracker:
         jump = float(np.linalg.norm(result.T_camera_object[:3, 3] - T_predicted[:3, 3]))
         supported = result.supported >= config.min_rays and result.support >= config.keep_support
         if supported and jump <= config.max_jump and result.constrained >= 1:
-            self._measure(target, view, result)
+            self._measure(target, view, result, jump)
             return
         target.filter.skip(view.stamp)
         valid = result.supported + result.occluded + result.missing
@@ -151,8 +151,13 @@ class ObjectTracker:
         if target.status is not TrackStatus.TENTATIVE:
             target.status = TrackStatus.OCCLUDED if inside > 0.3 else TrackStatus.OUT_OF_VIEW
 
-    def _measure(self, target: Target, view: View, result: RegistrationResult) -> None:
+    def _measure(self, target: Target, view: View, result: RegistrationResult, jump: float) -> None:
         """Fuse an accepted registration."""
+        gap = view.stamp - target.last_seen > self.config.unseen_gap * NANOSECONDS
+        if gap and target.known and jump > self.config.displaced and self._vague(target):
+            # It was moved while nobody looked, and its surface alone does not tell how: detections have to.
+            target.status, target.born = TrackStatus.TENTATIVE, view.stamp
+            target.detections, target.frames = 0, 0
         target.filter.update(self._measurement(view, result, target.last_seen))
         target.frames += 1
         target.last_seen = view.stamp
