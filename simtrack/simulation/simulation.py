@@ -17,7 +17,7 @@ from simtrack.contracts import (
     SensorFrame,
     StaticMap,
 )
-from simtrack.errors import FileFormatError, SimtrackError
+from simtrack.errors import FileFormatError, RenderingError, SimtrackError
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import rotation_from_rpy, transform
 from simtrack.objects import ObjectModel, TrackerModelConfig, tracker_model
@@ -95,6 +95,7 @@ class Simulation:
         self._shots = lidar.shots()
         self._packing = RayBundle.from_directions(self._shots.directions, self._shots.rings)
         self._counts: dict[str, int] = dict.fromkeys(("camera", "lidar", "proprioception"), 0)
+        self._closed = False
         self._now = 0
         self._steps = 0
         self._static_map: StaticMap | None = None
@@ -187,6 +188,8 @@ class Simulation:
             command: held from `now` on.
             want_rgb: render colour for the camera frame at the end.
         """
+        if self._closed:
+            raise RenderingError("the simulation is closed; make a new one")
         self._counts["camera"] += 1
         target = self._counts["camera"] * self.camera_period
         while self._history.end < target:
@@ -292,6 +295,7 @@ class Simulation:
 
     def close(self) -> None:
         """Release OpenGL and ray scenes; may be called twice. What was measured stays readable."""
+        self._closed = True
         self._worker.shutdown(wait=True)
         self._renderer.close()
         self.truth.close()
