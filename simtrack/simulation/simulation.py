@@ -187,6 +187,9 @@ class Simulation:
         Args:
             command: held from `now` on.
             want_rgb: render colour for the camera frame at the end.
+
+        Raises:
+            RenderingError: the simulation is closed.
         """
         if self._closed:
             raise RenderingError("the simulation is closed; make a new one")
