@@ -23,7 +23,7 @@ class TrackerConfig:
     buffer: float = 0.5
     """Depth images are kept this long for late detections, seconds."""
     confirm_detections: int = 2
-    """Detections that a new object needs before it is believed."""
+    """Detections that a new object needs before it is believed; one is enough where the fit leaves no doubt."""
     confirm_frames: int = 3
     """Registered frames that a new object needs before it is believed."""
     tentative_timeout: float = 1.2

@@ -165,7 +165,10 @@ class ObjectTracker:
         target.residual = result.residual
         target.moved_when_seen = target.filter.state.moving
         target.score = min(0.99, target.score + 0.05)
-        enough = target.detections >= self.config.confirm_detections and target.frames >= self.config.confirm_frames
+        # A fit that leaves no doubt needs no second detection to be believed.
+        clear = not self._doubtful(target) and not self._vague(target)
+        told = target.detections >= (1 if clear else self.config.confirm_detections)
+        enough = told and target.frames >= self.config.confirm_frames
         if enough or target.status is not TrackStatus.TENTATIVE:
             target.status, target.known = TrackStatus.CONFIRMED, True
 
