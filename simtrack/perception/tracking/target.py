@@ -52,7 +52,7 @@ class TrackerConfig:
     """one whose orientation the depth image determines no better than this, radians."""
     unseen_gap: float = 0.5
     """An object that was not seen for this long, seconds ..."""
-    displaced: float = 0.015
+    displaced: float = 0.04
     """... and then stands further than this from where it was, metres, has been moved; if vague, it is not believed."""
     shared_surface: float = 0.4
     """Two objects cannot both be there if they explain more than this share of the same measurements."""
