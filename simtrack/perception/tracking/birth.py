@@ -34,6 +34,8 @@ class FitConfig:
     """Registration may turn a hypothesis by at most this, radians: else it has slid into another minimum."""
     residual: float = 0.0045
     """Largest RMS residual along the normal, metres, at 1 m distance; grows with its square."""
+    edges: int = 8
+    """Fewest silhouette pixels that must have a depth step behind them: a flat side fits any wall."""
     constrained: int = 4
     """Fewest directions that the data must constrain."""
     rotation_sigma: float = np.deg2rad(4.0)
@@ -72,6 +74,7 @@ def believable(result: RegistrationResult, config: FitConfig) -> bool:
         and result.supported * result.stride**2 >= config.pixels
         and result.residual <= config.residual * max(1.0, z) ** 2
         and result.misfit <= config.misfit
+        and result.edges >= config.edges
         and result.constrained >= config.constrained
         and result.occluded <= config.occluded * result.rays
         and bool(np.all(known <= config.rotation_sigma**2))
