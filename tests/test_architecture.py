@@ -29,11 +29,12 @@ ROOMS = (
     "evaluation",
     "envs",
     "report",
+    "benchmarks",
     "cli",
 )
 """From top to bottom: a room imports only from itself and from rooms above it."""
 
-HIDDEN_FROM_PERCEPTION = {"simulation", "recordings", "datasets", "evaluation", "envs", "report", "cli"}
+HIDDEN_FROM_PERCEPTION = {"simulation", "recordings", "datasets", "evaluation", "envs", "report", "benchmarks", "cli"}
 HEAVY = {"numba", "scipy", "trimesh", "cv2", "mujoco", "skimage", "shapely", "pyoxigraph", "matplotlib", "embreex"}
 HEAVY |= {"pydantic", "manifold3d", "mcap", "rerun", "tyro", "rich"}
 IMPORT_NAMES = {

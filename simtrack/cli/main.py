@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import simtrack
 from simtrack.cli import console
+from simtrack.cli.bench import bench
 from simtrack.cli.objects import objects
 from simtrack.cli.query import query
 from simtrack.cli.replay import replay
@@ -20,6 +21,7 @@ VERBS = {
     "objects": objects,
     "query": query,
     "trials": trials,
+    "bench": bench,
 }
 DESCRIPTION = "Closed-loop test harness for object trackers and scene graphs of robots, with exact ground truth."
 

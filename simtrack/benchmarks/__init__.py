@@ -1,0 +1,1 @@
+"""Speed, measured: one module a benchmark, each with ``run(options) -> Benchmark``. Uses every other room."""
