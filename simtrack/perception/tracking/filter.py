@@ -134,17 +134,15 @@ class PoseFilter:
                 return _predicted(state, stamp, self.config).T_map_object
         return self._past[0][0].T_map_object
 
+    def starts_to_move(self, measurement: Measurement) -> bool:
+        """Whether a measurement at the present contradicts that the object stands still as it did so far."""
+        state = _predicted(self.state, measurement.stamp, self.config, measurement.drift)
+        return not state.moving and _surprise(state, measurement) > self.config.start_threshold
+
     def _fuse(self, m: Measurement) -> None:
         state = _predicted(self.state, m.stamp, self.config, m.drift)
         innovation, S = _innovation(state, m)
-        # Judge by the directions that were measured at all: the others have a variance of about 1.
-        measured = np.diag(m.covariance)[:6] < 0.05
-        surprise = 0.0
-        if measured.any():
-            index = np.flatnonzero(measured)
-            e = innovation[index]
-            surprise = float(e @ np.linalg.solve(S[np.ix_(index, index)], e)) / len(index)
-        if not state.moving and surprise > self.config.start_threshold:
+        if not state.moving and _surprise(state, m) > self.config.start_threshold:
             state = _predicted(replace(self.state, moving=True), m.stamp, self.config, m.drift)
             P = state.covariance.copy()
             dt = max((m.stamp - self.state.stamp) / NANOSECONDS, 1e-3)
@@ -194,6 +192,16 @@ class PoseFilter:
 def _innovation(state: FilterState, m: Measurement) -> tuple[Float64, Float64]:
     S = state.covariance[:6, :6] + m.covariance
     return difference(m.T_map_object, state.T_map_object), S
+
+
+def _surprise(state: FilterState, m: Measurement) -> float:
+    """Mean squared innovation per direction that was measured at all: the others have a variance of about 1."""
+    index = np.flatnonzero(np.diag(m.covariance) < 0.05)
+    if not len(index):
+        return 0.0
+    innovation, S = _innovation(state, m)
+    e = innovation[index]
+    return float(e @ np.linalg.solve(S[np.ix_(index, index)], e)) / len(index)
 
 
 def _predicted(state: FilterState, stamp: int, config: FilterConfig, drift: Float64 | None = None) -> FilterState:

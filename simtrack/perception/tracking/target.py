@@ -54,6 +54,12 @@ class TrackerConfig:
     """An object that was not seen for this long, seconds ..."""
     displaced: float = 0.04
     """... and then stands further than this from where it was, metres, has been moved; if vague, it is not believed."""
+    fastest: float = 1.2
+    """Nothing that hands carry moves faster than this, m/s; a registration that says so has slid off ..."""
+    fastest_turn: float = 4.0
+    """... or turns faster than this, rad/s."""
+    doubt_after: int = 3
+    """So many registrations in a row that cannot be believed end the belief in a track."""
     shared_surface: float = 0.4
     """Two objects cannot both be there if they explain more than this share of the same measurements."""
     localization_correlation: float = 0.3
@@ -89,6 +95,8 @@ class Target:
     last_seen: int = 0
     missing_since: int | None = None
     disagreements: int = 0
+    doubts: int = 0
+    """Registrations in a row that were not believed."""
     moved_when_seen: bool = False
     known: bool = False
     """It was believed once: its identity is kept for when it turns up again."""

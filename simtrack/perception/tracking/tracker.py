@@ -156,9 +156,16 @@ class ObjectTracker:
         gap = view.stamp - target.last_seen > self.config.unseen_gap * NANOSECONDS
         if gap and target.known and jump > self.config.displaced and self._vague(target):
             # It was moved while nobody looked, and its surface alone does not tell how: detections have to.
-            target.status, target.born = TrackStatus.TENTATIVE, view.stamp
-            target.detections, target.frames = 0, 0
-        target.filter.update(self._measurement(view, result, target.last_seen))
+            self._demote(target, view.stamp)
+        measurement = self._measurement(view, result, target.last_seen)
+        if target.known and self._incredible(target, measurement):
+            target.filter.skip(view.stamp)
+            target.doubts += 1
+            if target.doubts >= self.config.doubt_after and target.status is not TrackStatus.TENTATIVE:
+                self._demote(target, view.stamp)
+            return
+        target.doubts = 0
+        target.filter.update(measurement)
         target.frames += 1
         target.last_seen = view.stamp
         target.missing_since = None
@@ -171,6 +178,26 @@ class ObjectTracker:
         enough = told and target.frames >= self.config.confirm_frames
         if enough or target.status is not TrackStatus.TENTATIVE:
             target.status, target.known = TrackStatus.CONFIRMED, True
+
+    def _incredible(self, target: Target, m: Measurement) -> bool:
+        """Whether a registration tells of a motion that is too fast for hands, or that it cannot tell of.
+
+        A hand that takes a small thing far away is one blob with it: its registration follows the hand. So an object
+        that stood still is only believed to move if the depth image determines its orientation.
+        """
+        span = 0.1
+        T_before = target.filter.pose_at(m.stamp - round(span * NANOSECONDS))
+        moved = float(np.linalg.norm(m.T_map_object[:3, 3] - T_before[:3, 3]))
+        turned = rotation_apart(m.T_map_object, T_before, target.model)
+        if moved > self.config.fastest * span or turned > self.config.fastest_turn * span:
+            return True
+        return self._vague(target) and target.filter.starts_to_move(m)
+
+    @staticmethod
+    def _demote(target: Target, stamp: int) -> None:
+        """End the belief in a track until detections bear it out."""
+        target.status, target.born = TrackStatus.TENTATIVE, stamp
+        target.detections, target.frames, target.disagreements, target.doubts = 0, 0, 0, 0
 
     def _measurement(self, view: View, result: RegistrationResult, last_seen: int) -> Measurement:
         """A registration in the map frame; the camera's own error wanders, correlated over time."""
@@ -239,8 +266,7 @@ class ObjectTracker:
             self._contest(target, T_camera_object, group, view)
         if target.disagreements >= self.config.demote_after and self._vague(target):
             # Detections say again and again that it is otherwise, and the depth image cannot tell: no knowledge.
-            target.status, target.born = TrackStatus.TENTATIVE, self._views[-1].stamp
-            target.detections, target.disagreements = 0, 0
+            self._demote(target, self._views[-1].stamp)
 
     def _vague(self, target: Target) -> bool:
         """Whether the depth image determines a track's orientation too poorly to outweigh detections."""
@@ -347,9 +373,10 @@ class ObjectTracker:
         if lost:
             return self._revive(max(lost, key=lambda t: t.last_seen), followed.state.stamp)
         for target in self._targets:
-            unseen = target.status in (TrackStatus.OCCLUDED, TrackStatus.OUT_OF_VIEW)
+            unseen = target.status in (TrackStatus.OCCLUDED, TrackStatus.OUT_OF_VIEW) and target.moved_when_seen
+            demoted = target.status is TrackStatus.TENTATIVE and target.known
             age = (followed.state.stamp - target.last_seen) / NANOSECONDS
-            if target.model is not model or not unseen or not target.moved_when_seen:
+            if target.model is not model or not (unseen or demoted):
                 continue
             distance = np.linalg.norm(followed.state.T_map_object[:3, 3] - target.filter.state.T_map_object[:3, 3])
             if age < self.config.same_object_memory and distance < 0.15 + self.config.same_object_speed * age:
