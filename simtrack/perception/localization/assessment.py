@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from simtrack.contracts import Float64
 from simtrack.perception.localization.measurement import Measurement
-from simtrack.perception.localization.surface import MapSurface
+from simtrack.perception.localization.surface import MapSurface, View
 
 Verdicts: TypeAlias = npt.NDArray[np.int8]
 
@@ -40,24 +40,18 @@ def assess(measurement: Measurement, surface: MapSurface, T_map_base: Float64, t
     `tolerance` is the distance in metres between a measured point and the map's surface that still counts as
     explained, on top of three standard deviations of the sensor.
     """
+    return judge(surface.cast(T_map_base, measurement), tolerance) if len(measurement) else UNJUDGED
+
+
+def judge(view: View, tolerance: float = 0.06) -> Assessment:
+    """Judge the pose that a view was cast from; see `assess`."""
     from simtrack.perception.localization.kernels import explain
 
-    if not len(measurement):
-        return UNJUDGED
-    hits, passed = surface.cast(T_map_base, measurement)
-    directions = measurement.directions @ T_map_base[:3, :3].T
-    cosines = np.einsum("ij,ij->i", hits.normals, directions)
-    kinds = explain(measurement.ranges, measurement.sigmas, hits.distances, hits.normals, cosines, tolerance)
-    verdicts = np.array([2, 2, 0, -1, 0], np.int8)[kinds]
-    verdicts[passed & (verdicts == 2)] = 1
-    rest = max(int(np.count_nonzero(kinds != 0)), 1)
-    structure = float(np.maximum(verdicts[kinds != 0], 0).sum()) / (2.0 * rest)
-    return Assessment(
-        float(np.count_nonzero(verdicts == 2)) / len(kinds),
-        structure,
-        int(np.count_nonzero(kinds == 3)) / rest,
-        verdicts,
+    hits = view.hits
+    verdicts, explained, structure, through, rest = explain(
+        len(view), view.ranges, view.sigmas, view.directions, hits.distances, hits.normals, view.passed, tolerance
     )
+    return Assessment(explained / len(view), 0.5 * structure / max(rest, 1), through / max(rest, 1), verdicts)
 
 
 def lead(a: list[Verdicts], b: list[Verdicts]) -> tuple[float, float]:

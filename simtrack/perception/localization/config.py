@@ -50,7 +50,10 @@ class RegistrationConfig:
     """MICP-L: how one measurement is registered to the mesh map."""
 
     strides: tuple[int, ...] = (5, 3, 2)
-    """Every how many-th shot takes part, one entry a ray-casting iteration. Coarse first: the last one decides."""
+    """Every how many-th block of shots takes part, one entry a ray-casting iteration. Coarse first: the last one
+    decides."""
+    settled: float = 0.01
+    """m, at the median range: an iteration that moves the pose by less is followed by the last one at once."""
     inner_iterations: int = 5
     """Gauss-Newton steps on the correspondences of one ray-casting iteration."""
     step_tolerance: float = 5e-5

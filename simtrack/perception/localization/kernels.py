@@ -1,65 +1,132 @@
-"""Compiled inner loops of the localizer. All sums run in one fixed order, so results do not depend on threads."""
+"""Compiled loops of the localizer around the casts: de-skewing, aiming rays, judging what they met, the map's normals.
+
+All run on the calling thread in one fixed order, so results do not depend on threads.
+"""
+
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
 from simtrack.contracts import Float64
 
+BLOCK = 4
+"""Neighbouring shots that are thinned together: rays of a packet are traced fast if they are close to each other."""
+_BEND = 2e-3
+"""rad: within a turn of this a moving sensor's pose is interpolated linearly, which bends rays by less than 1e-6."""
+_STEP = np.float32(1e-3)
+"""m behind a surface at which a ray that passes through it goes on."""
+
 
 @nb.njit(cache=True, nogil=True)
 def deskew_shots(
-    directions: Float64,
-    times: Float64,
-    shots: np.ndarray,
+    directions: np.ndarray,
+    times: np.ndarray,
+    ranges: np.ndarray,
+    rings: np.ndarray,
+    masked: np.ndarray,
+    min_range: float,
+    max_range: float,
     T_base_lidar: Float64,
     knot_times: Float64,
     knots: Float64,
-    turns: Float64,
-) -> tuple[Float64, Float64]:
-    """Origins and directions (M, 3) of the given shots in the base frame at the last knot.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The valid shots of a turn in the base frame at the last knot, ring by ring.
 
     Between two knots T_end_base(t) moves on a straight line and turns about a fixed axis.
 
     Args:
-        directions: (N, 3), lidar frame.
-        times: (N,), seconds.
-        shots: (M,) int64, which of the N.
+        directions: (N, 3) float32, lidar frame.
+        times: (N,) float32, seconds.
+        ranges: (N,) float32, metres.
+        rings: (N,) uint8.
+        masked: (N,) bool, shots to leave out, or empty.
+        min_range: metres, shorter ranges are left out.
+        max_range: metres, longer ones too.
         T_base_lidar: (4, 4).
         knot_times: (K,), seconds.
         knots: (K, 4, 4), T_end_base at the knots.
-        turns: (K - 1, 3), rotation vectors from knot to knot, left perturbation.
+
+    Returns:
+        origins (M, 3), directions (M, 3) and ranges (M,), float32, and (M,) int32, which of the N each shot is.
     """
-    count = shots.shape[0]
-    origins, turned = np.empty((count, 3)), np.empty((count, 3))
-    last = knot_times.shape[0] - 2
-    mount, d, R, t = T_base_lidar[:3, 3].copy(), np.empty(3), np.empty((3, 3)), np.empty(3)
-    for row in range(count):
-        shot = shots[row]
-        time = times[shot]
-        k = 0
-        while k < last and time >= knot_times[k + 1]:
+    clocks, poses = _sensor_track(T_base_lidar, knot_times, knots)
+    count = ranges.shape[0]
+    valid = np.empty(count, np.bool_)
+    slots = np.zeros(257, np.int64)
+    for i in range(count):
+        finite = np.isfinite(directions[i, 0] + directions[i, 1] + directions[i, 2] + times[i] + ranges[i])
+        valid[i] = finite and min_range <= ranges[i] <= max_range and not (masked.shape[0] > 0 and masked[i])
+        slots[rings[i] + 1] += valid[i]
+    for ring in range(256):
+        slots[ring + 1] += slots[ring]
+    kept = slots[256]
+    origins, turned = np.empty((kept, 3), np.float32), np.empty((kept, 3), np.float32)
+    lengths, shots = np.empty(kept, np.float32), np.empty(kept, np.int32)
+    last, k = clocks.shape[0] - 2, 0
+    for i in range(count):
+        if not valid[i]:
+            continue
+        row = slots[rings[i]]
+        slots[rings[i]] = row + 1
+        time = times[i]
+        if time < clocks[k]:
+            k = 0
+        while k < last and time >= clocks[k + 1]:
             k += 1
-        if last < 0:
-            R[:, :] = knots[0, :3, :3]
-            t[:] = knots[0, :3, 3]
-        else:
-            share = (time - knot_times[k]) / (knot_times[k + 1] - knot_times[k])
-            for i in range(3):
-                t[i] = knots[k, i, 3] + share * (knots[k + 1, i, 3] - knots[k, i, 3])
-            _turn(share * turns[k, 0], share * turns[k, 1], share * turns[k, 2], knots[k], R)
-        for i in range(3):
-            d[i] = 0.0
-            for j in range(3):
-                d[i] += T_base_lidar[i, j] * directions[shot, j]
-        for i in range(3):
-            origins[row, i] = t[i] + R[i, 0] * mount[0] + R[i, 1] * mount[1] + R[i, 2] * mount[2]
-            turned[row, i] = R[i, 0] * d[0] + R[i, 1] * d[1] + R[i, 2] * d[2]
-    return origins, turned
+        share = np.float32((time - clocks[k]) / (clocks[k + 1] - clocks[k]))
+        rest = np.float32(1.0) - share
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        for a in range(3):
+            rx = rest * poses[k, a, 0] + share * poses[k + 1, a, 0]
+            ry = rest * poses[k, a, 1] + share * poses[k + 1, a, 1]
+            rz = rest * poses[k, a, 2] + share * poses[k + 1, a, 2]
+            turned[row, a] = rx * x + ry * y + rz * z
+            origins[row, a] = rest * poses[k, a, 3] + share * poses[k + 1, a, 3]
+        lengths[row], shots[row] = ranges[i], i
+    return origins, turned, lengths, shots
 
 
 @nb.njit(cache=True, nogil=True)
-def _turn(x: float, y: float, z: float, knot: Float64, out: Float64) -> None:
-    """Out = Exp((x, y, z)) @ knot[:3, :3], by Rodrigues' formula applied to each column."""
+def _sensor_track(T_base_lidar: Float64, knot_times: Float64, knots: Float64) -> tuple[Float64, np.ndarray]:
+    """Times (L,) and T_end_lidar (L, 3, 4) float32, L >= 2, so close that between them linear interpolation does."""
+    spans = knot_times.shape[0] - 1
+    clocks, track = [knot_times[0]], [knots[0] @ T_base_lidar]
+    T = np.eye(4)
+    for k in range(spans):
+        phi = rotation_vector(knots[k + 1], knots[k])
+        pieces = int(np.sqrt(phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2) / _BEND) + 1
+        for piece in range(1, pieces + 1):
+            share = piece / pieces
+            turn(share * phi[0], share * phi[1], share * phi[2], knots[k], T)
+            T[:3, 3] = (1.0 - share) * knots[k, :3, 3] + share * knots[k + 1, :3, 3]
+            clocks.append((1.0 - share) * knot_times[k] + share * knot_times[k + 1])
+            track.append(T @ T_base_lidar)
+    if spans < 1:  # no time passes
+        clocks.append(clocks[0] + 1.0)
+        track.append(track[0])
+    poses = np.empty((len(track), 3, 4), np.float32)
+    for k in range(len(track)):
+        poses[k] = track[k][:3]
+    return np.array(clocks), poses
+
+
+@nb.njit(cache=True, nogil=True)
+def rotation_vector(T_to: Float64, T_from: Float64) -> Float64:
+    """(3,) rotation vector, left perturbation, from one rotation (the first 3x3) to another; less than half a turn."""
+    trace, v = 0.0, np.zeros(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            trace += T_to[i, c] * T_from[i, c]
+            v[i] += 0.5 * (T_to[k, c] * T_from[j, c] - T_to[j, c] * T_from[k, c])
+    sine = np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+    return v if sine < 1e-9 else v * (np.arctan2(sine, 0.5 * (trace - 1.0)) / sine)
+
+
+@nb.njit(cache=True, nogil=True)
+def turn(x: float, y: float, z: float, matrix: Float64, out: Float64) -> None:
+    """First three columns of out = Exp((x, y, z)) @ matrix, by Rodrigues' formula applied to each of them."""
     angle2 = x * x + y * y + z * z
     if angle2 < 1e-16:
         a, b = 1.0, 0.5
@@ -67,7 +134,7 @@ def _turn(x: float, y: float, z: float, knot: Float64, out: Float64) -> None:
         angle = np.sqrt(angle2)
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
     for j in range(3):
-        v0, v1, v2 = knot[0, j], knot[1, j], knot[2, j]
+        v0, v1, v2 = matrix[0, j], matrix[1, j], matrix[2, j]
         c0, c1, c2 = y * v2 - z * v1, z * v0 - x * v2, x * v1 - y * v0
         out[0, j] = v0 + a * c0 + b * (y * c2 - z * c1)
         out[1, j] = v1 + a * c1 + b * (z * c0 - x * c2)
@@ -75,174 +142,170 @@ def _turn(x: float, y: float, z: float, knot: Float64, out: Float64) -> None:
 
 
 @nb.njit(cache=True, nogil=True)
-def correspond(
+def thinned_count(count: int, stride: int) -> int:
+    """How many of `count` shots `aim` takes."""
+    blocks = (count + BLOCK - 1) // BLOCK
+    last = (blocks + stride - 1) // stride - 1
+    return last * BLOCK + min(BLOCK, count - last * stride * BLOCK) if count > 0 else 0
+
+
+@nb.njit(cache=True, nogil=True)
+def aim(
     T: Float64,
-    origins: Float64,
-    directions: Float64,
-    ranges: Float64,
-    sigmas: Float64,
-    distances: np.ndarray,
-    normals: np.ndarray,
-    faces: np.ndarray,
-    instances: np.ndarray,
-    face_normals: np.ndarray,
-    patches: np.ndarray,
-    map_instance: int,
-    gate: float,
-    pointing_sigma: float,
-    patch_variance: float,
-    counts: np.ndarray,
-) -> tuple[Float64, Float64, Float64, Float64, int]:
-    """Point-to-plane correspondences along the rays, gated, with their whitening weights.
+    origins: np.ndarray,
+    directions: np.ndarray,
+    ranges: np.ndarray,
+    sigmas: np.ndarray,
+    stride: int,
+    out: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """Move every `stride`-th block of shots (N, ...) by T (4, 4) into origins, directions, ranges and sigmas of `out`.
 
-    A ray's plane passes through the hit of the ray cast from the current estimate. The planes of one patch of the map
-    share its error (variance `patch_variance`), so n rays on one patch together carry no more than 1 / patch_variance:
-    marginalising the shared error of equal Jacobians gives each ray the weight 1 / (sigma^2 + n patch_variance).
+    Rows of `out` that are left over become rays without direction, which meet nothing.
+    """
+    to_origins, to_directions, to_ranges, to_sigmas = out
+    matrix, offset = T[:3, :3].astype(np.float32), T[:3, 3].copy()
+    count = thinned_count(ranges.shape[0], stride)
+    for j in range(count):
+        i = (j // BLOCK) * stride * BLOCK + j % BLOCK
+        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
+        u, v, w = directions[i, 0], directions[i, 1], directions[i, 2]
+        for a in range(3):
+            moved = matrix[a, 0] * x + matrix[a, 1] * y + matrix[a, 2] * z
+            to_origins[j, a] = moved + offset[a]
+            to_directions[j, a] = matrix[a, 0] * u + matrix[a, 1] * v + matrix[a, 2] * w
+        to_ranges[j], to_sigmas[j] = ranges[i], sigmas[i]
+    to_origins[count:], to_directions[count:] = 0.0, 0.0
+
+
+class Follow(NamedTuple):
+    """Rays that go on behind what they met first; rows of them are used, one a ray."""
+
+    rows: np.ndarray
+    """(N,) int32, which ray of the view."""
+    starts: np.ndarray
+    """(N,) float32, metres from the sensor at which it goes on."""
+    seeks: np.ndarray
+    """(N,) int8: 0 the first surface that faces the sensor, 1 the next one behind that."""
+    casts: np.ndarray
+    """(N,) int8, how often it may still be cast."""
+
+
+@nb.njit(cache=True, nogil=True)
+def unsettled(count, directions, ranges, distances, normals, reach, backs, follow, passed):
+    """Find the rays of a view that go on behind what they met: a surface from behind, or one that the shot passed.
+
+    Args:
+        count: rays of the view.
+        directions: of the view ...
+        ranges: ... likewise ...
+        distances: ... likewise ...
+        normals: ... likewise.
+        reach: metres by which a shot must have gone farther than its ray.
+        backs: surfaces that a ray may pass from behind.
+        follow: is filled.
+        passed: (N,) bool, is cleared.
 
     Returns:
-        points (M, 3) in the base frame, planes (M, 4) as normal and offset in the map, weights (M,) = information of
-        the residual, map-only weights (M,) = 1 / (n patch_variance), and the number of rays that hit the map at all.
+        How many rows of `follow` are in use.
     """
-    count = ranges.shape[0]
-    points, planes = np.empty((count, 3)), np.empty((count, 4))
-    variances, hit_patches = np.empty(count), np.empty(count, np.int64)
-    kept, hits = 0, 0
-    R, t, d = T[:3, :3].copy(), T[:3, 3].copy(), np.empty(3)
+    used = 0
     for i in range(count):
-        if instances[i] != map_instance or not np.isfinite(distances[i]):
-            continue
-        for a in range(3):
-            d[a] = R[a, 0] * directions[i, 0] + R[a, 1] * directions[i, 1] + R[a, 2] * directions[i, 2]
-        facing = normals[i, 0] * d[0] + normals[i, 1] * d[1] + normals[i, 2] * d[2]
-        if facing >= 0.0:
-            continue  # from inside a body: no surface that the sensor could have seen
-        hits += 1
-        face = faces[i]
-        n0, n1, n2 = face_normals[face, 0], face_normals[face, 1], face_normals[face, 2]
-        cosine = n0 * d[0] + n1 * d[1] + n2 * d[2]
-        slip = ranges[i] - distances[i]
-        if abs(cosine * slip) > gate or abs(slip) > 6.0 * gate + 0.1:
-            continue
-        offset = 0.0
-        for a in range(3):
-            o = R[a, 0] * origins[i, 0] + R[a, 1] * origins[i, 1] + R[a, 2] * origins[i, 2] + t[a]
-            offset += face_normals[face, a] * (o + distances[i] * d[a])
-            points[kept, a] = origins[i, a] + ranges[i] * directions[i, a]
-        planes[kept, 0], planes[kept, 1], planes[kept, 2], planes[kept, 3] = n0, n1, n2, offset
-        across = pointing_sigma * ranges[i]
-        variances[kept] = sigmas[i] ** 2 * cosine * cosine + across * across * (1.0 - cosine * cosine) + 1e-8
-        hit_patches[kept] = patches[face]
-        counts[patches[face]] += 1
-        kept += 1
-    weights, map_weights = np.empty(kept), np.empty(kept)
-    for i in range(kept):
-        shared = counts[hit_patches[i]] * patch_variance
-        weights[i] = 1.0 / (variances[i] + shared)
-        map_weights[i] = 1.0 / max(shared, 1e-12)
-    for i in range(kept):
-        counts[hit_patches[i]] = 0
-    return points[:kept], planes[:kept], weights, map_weights, hits
+        passed[i] = False
+        facing = normals[i, 0] * directions[i, 0] + normals[i, 1] * directions[i, 1] + normals[i, 2] * directions[i, 2]
+        behind = facing > 0.0
+        if behind or ranges[i] > distances[i] + reach:
+            follow.rows[used] = i
+            follow.starts[used] = distances[i] + _STEP
+            follow.seeks[used] = 0 if behind else 1
+            follow.casts[used] = backs if behind else backs + 1
+            used += 1
+    return used
 
 
 @nb.njit(cache=True, nogil=True)
-def plane_distances(T: Float64, points: Float64, planes: Float64) -> Float64:
-    """(M,) absolute distances in metres of points (M, 3) in the base frame to planes (M, 4) in the map."""
-    out = np.empty(points.shape[0])
-    for i in range(points.shape[0]):
-        e = -planes[i, 3]
+def aim_onward(used, follow, origins, directions, to_origins, to_directions):
+    """Origins and directions, (N, 3) float32 of which `used` rows are filled, of the rays that go on."""
+    for s in range(used):
+        i, start = follow.rows[s], follow.starts[s]
         for a in range(3):
-            e += planes[i, a] * (T[a, 0] * points[i, 0] + T[a, 1] * points[i, 1] + T[a, 2] * points[i, 2] + T[a, 3])
-        out[i] = abs(e)
-    return out
+            to_origins[s, a] = origins[i, a] + start * directions[i, a]
+            to_directions[s, a] = directions[i, a]
 
 
 @nb.njit(cache=True, nogil=True)
-def normal_equations(
-    T: Float64, points: Float64, planes: Float64, weights: Float64, map_weights: Float64, kernel: float
-) -> tuple[Float64, Float64, Float64, Float64, Float64]:
-    """Normal equations of point-to-plane registration with a Geman-McClure kernel.
+def advance(used, directions, ranges, hits, onward, reach, ends, backs, follow, passed):
+    """Take what the rays that went on have met.
 
-    Residual ``e = n . (R p + t) - offset``; for the decoupled left perturbation ``J = [n, (R p) x n]``.
+    Args:
+        used: rows of `follow` in use.
+        directions: of the view ...
+        ranges: ... likewise.
+        hits: distances, normals, faces and instances of the view; is changed.
+        onward: likewise, of the `used` rays that went on.
+        reach: see `unsettled`.
+        ends: metres; a shot that passed a surface belongs to the next one if it ends so close to that.
+        backs: see `unsettled`.
+        follow: is changed.
+        passed: (N,) bool, is set where a shot belongs to the second surface.
 
     Returns:
-        information (6, 6), gradient (6,), map-only information (6, 6), the information (6, 6) that the same rays
-        would have if their normals pointed anywhere (``sum w B B^T``, ``B = [I; [R p]x]``), and
-        statistics (3,): sum of w_robust, sum of w_robust e^2, sum of |R p|^2 w_robust.
+        How many rows of `follow` are still in use.
     """
-    H, M, S = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
-    g, stats, J, q = np.zeros(6), np.zeros(3), np.empty(6), np.empty(3)
-    R, t = T[:3, :3].copy(), T[:3, 3].copy()
-    scale2 = kernel * kernel
-    for i in range(points.shape[0]):
+    distances, normals, faces, instances = hits
+    kept = 0
+    for s in range(used):
+        i = follow.rows[s]
+        found = follow.starts[s] + onward[0][s]
+        facing = np.float32(0.0)
         for a in range(3):
-            q[a] = R[a, 0] * points[i, 0] + R[a, 1] * points[i, 1] + R[a, 2] * points[i, 2]
-        n0, n1, n2 = planes[i, 0], planes[i, 1], planes[i, 2]
-        e = n0 * (q[0] + t[0]) + n1 * (q[1] + t[1]) + n2 * (q[2] + t[2]) - planes[i, 3]
-        share = scale2 / (scale2 + e * e)
-        robust = share * share
-        w = weights[i] * robust
-        wm = map_weights[i] * robust
-        J[0], J[1], J[2] = n0, n1, n2
-        J[3] = q[1] * n2 - q[2] * n1
-        J[4] = q[2] * n0 - q[0] * n2
-        J[5] = q[0] * n1 - q[1] * n0
-        for a in range(6):
-            g[a] += w * e * J[a]
-            for b in range(a, 6):
-                H[a, b] += w * J[a] * J[b]
-                M[a, b] += wm * J[a] * J[b]
-        norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2]
-        for a in range(3):
-            S[a, a] += w
-            S[3 + a, 3 + a] += w * (norm2 - q[a] * q[a])
-        S[0, 4] += w * q[2]
-        S[0, 5] -= w * q[1]
-        S[1, 3] -= w * q[2]
-        S[1, 5] += w * q[0]
-        S[2, 3] += w * q[1]
-        S[2, 4] -= w * q[0]
-        S[3, 4] -= w * q[0] * q[1]
-        S[3, 5] -= w * q[0] * q[2]
-        S[4, 5] -= w * q[1] * q[2]
-        stats[0] += robust
-        stats[1] += robust * e * e
-        stats[2] += robust * norm2
-    for a in range(6):
-        for b in range(a):
-            H[a, b], M[a, b], S[a, b] = H[b, a], M[b, a], S[b, a]
-    return H, g, M, S, stats
+            facing += onward[1][s, a] * directions[i, a]
+        casts, seeks, again = follow.casts[s] - 1, follow.seeks[s], False
+        if facing > 0.0 and casts > 0:
+            again = True
+        elif seeks == 0 or abs(ranges[i] - found) < ends:
+            distances[i], faces[i], instances[i] = found, onward[2][s], onward[3][s]
+            for a in range(3):
+                normals[i, a] = onward[1][s, a]
+            passed[i] = seeks == 1
+            if seeks == 0 and ranges[i] > found + reach:
+                seeks, casts, again = 1, backs + 1, True
+        if again:
+            follow.rows[kept], follow.starts[kept] = i, found + _STEP
+            follow.seeks[kept], follow.casts[kept] = seeks, casts
+            kept += 1
+    return kept
 
 
 @nb.njit(cache=True, nogil=True)
-def explain(
-    ranges: Float64,
-    sigmas: Float64,
-    distances: np.ndarray,
-    normals: np.ndarray,
-    cosines: Float64,
-    tolerance: float,
-) -> np.ndarray:
-    """What the map says about each shot.
+def explain(count, ranges, sigmas, directions, distances, normals, passed, tolerance):
+    """What the map says about each shot of a view (see `simtrack.perception.localization.assessment.Assessment`).
+
+    A shot is explained if it ends within `tolerance` metres, and three standard deviations, of a surface that faces the
+    sensor, by a level surface (floor, ceiling) or by structure. Else it ends in front of the map (something that the
+    map does not have), reaches through its surface, or the map has nothing there.
 
     Returns:
-        (N,) int8: 0 explained by a floor, ceiling or other level surface; 1 explained by structure; 2 the measurement
-        ends in front of the map (something that the map does not have); 3 it reaches through the map's surface;
-        4 the map has nothing there.
+        (count,) int8 verdicts, and four counts: explained shots, explained structure (twice; once what lies behind a
+        surface that was passed over), shots that reach through, and shots that no level surface explains.
     """
-    out = np.empty(ranges.shape[0], np.int8)
-    for i in range(ranges.shape[0]):
-        if not np.isfinite(distances[i]):
-            out[i] = 4
-            continue
+    verdicts = np.empty(count, np.int8)
+    explained, structure, through, rest = 0, 0, 0, 0
+    for i in range(count):
+        cosine = normals[i, 0] * directions[i, 0] + normals[i, 1] * directions[i, 1] + normals[i, 2] * directions[i, 2]
         slip = ranges[i] - distances[i]
         limit = tolerance + 3.0 * sigmas[i]
-        if cosines[i] < 0.0 and abs(slip * cosines[i]) <= limit and abs(slip) <= 8.0 * limit:
-            out[i] = 0 if abs(normals[i, 2]) > 0.8 else 1
-        elif slip < 0.0:
-            out[i] = 2
-        else:
-            out[i] = 3
-    return out
+        verdict, level = 0, False
+        if cosine < 0.0 and abs(slip * cosine) <= limit and abs(slip) <= 8.0 * limit:
+            verdict, level = (1 if passed[i] else 2), abs(normals[i, 2]) > 0.8
+        elif slip >= 0.0:
+            verdict = -1
+        verdicts[i] = verdict
+        explained += verdict == 2
+        through += verdict == -1
+        rest += not level
+        structure += 0 if level else max(verdict, 0)
+    return verdicts, explained, structure, through, rest
 
 
 @nb.njit(cache=True, nogil=True)

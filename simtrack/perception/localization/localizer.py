@@ -20,7 +20,7 @@ from simtrack.contracts import (
 )
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import difference, interpolate, inverse, is_rigid, rotate_covariance
-from simtrack.perception.localization.assessment import assess
+from simtrack.perception.localization.assessment import UNJUDGED
 from simtrack.perception.localization.config import LocalizerConfig
 from simtrack.perception.localization.measurement import Measurement, depth_measurement, deskew, scan_end
 from simtrack.perception.localization.motion import OdometryTrack, propagate
@@ -154,8 +154,8 @@ class MeshLocalizer:
         mask = self._depth_mask(frame) if self._depth_mask is not None else None
         shots = depth_measurement(frame, self.config.depth_stride, self.config.depth_max_range, mask)
         T, P = self._predicted(frame.stamp)
-        found = register(shots, self.surface, T, P, self.config.registration, strides=(2, 1))
-        share = assess(shots, self.surface, found.T_map_base).explained
+        found = register(shots, self.surface, T, P, self.config.registration, strides=(2, 1), assessed=True)
+        share = (found.assessment or UNJUDGED).explained
         if not found.converged or share < self.config.recovery.min_share or self._contradicts(found, T, P):
             return self._restated(frame.stamp, Status.NO_DATA)
         self._anchor(frame.stamp, found.T_map_base, found.covariance)
@@ -186,8 +186,8 @@ class MeshLocalizer:
         T, P = self._predicted(measurement.stamp)
         skew = 0.25 * self._odometry.noise(scan_start, measurement.stamp)
         turned = rotate_covariance(T[:3, :3], skew)
-        found = register(measurement, self.surface, T, P, self.config.registration, systematic=turned)
-        judged = assess(measurement.thinned(7), self.surface, found.T_map_base)
+        found = register(measurement, self.surface, T, P, self.config.registration, systematic=turned, assessed=True)
+        judged = found.assessment or UNJUDGED
         c = self.config.recovery
         if not self._level:  # the first scan from a start pose that was given as sure
             if judged.structure < c.accept_share:

@@ -1,12 +1,11 @@
 """Range measurements as registration takes them: shots with own origins, all in the base frame of one stamp."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
-from simtrack.contracts import NANOSECONDS, Bool, Float64, LidarScan, RgbdFrame
-from simtrack.geometry.transforms import inverse, log_so3
+from simtrack.contracts import NANOSECONDS, Bool, Float32, Float64, Int32, LidarScan, RgbdFrame
+from simtrack.geometry.transforms import inverse
 from simtrack.perception.localization.motion import OdometryTrack
 
 
@@ -16,16 +15,16 @@ class Measurement:
 
     stamp: int
     """Nanoseconds: the time at which the base frame is meant."""
-    origins: Float64
+    origins: Float32
     """(N, 3), base frame, metres: where each shot left the sensor."""
-    directions: Float64
+    directions: Float32
     """(N, 3), base frame, unit length."""
-    ranges: Float64
+    ranges: Float32
     """(N,), metres along the ray, finite."""
-    sigmas: Float64
+    sigmas: Float32
     """(N,), metres, standard deviation along the ray."""
-    shots: np.ndarray
-    """(N,) int64: index of each in the sensor's own order."""
+    shots: Int32
+    """(N,), index of each in the sensor's own order."""
 
     def __len__(self) -> int:
         return len(self.ranges)
@@ -33,20 +32,19 @@ class Measurement:
     @property
     def points(self) -> Float64:
         """(N, 3), base frame: what was hit."""
-        return self.origins + self.ranges[:, None] * self.directions
+        return self.origins + self.ranges[:, None].astype(np.float64) * self.directions
 
     def thinned(self, stride: int) -> "Measurement":
         """Every `stride`-th shot."""
         if stride == 1:
             return self
-        take = slice(None, None, stride)
         return Measurement(
             self.stamp,
-            self.origins[take],
-            self.directions[take],
-            self.ranges[take],
-            self.sigmas[take],
-            self.shots[take],
+            self.origins[::stride].copy(),
+            self.directions[::stride].copy(),
+            self.ranges[::stride].copy(),
+            self.sigmas[::stride].copy(),
+            self.shots[::stride].copy(),
         )
 
 
@@ -81,29 +79,23 @@ def deskew(
     from simtrack.perception.localization.kernels import deskew_shots
 
     end = scan_end(scan)
-    ranges = np.asarray(scan.ranges, dtype=np.float64)
-    with np.errstate(invalid="ignore"):
-        valid = np.isfinite(ranges) & (ranges >= min_range) & (ranges <= max_range)
-    valid &= np.isfinite(scan.times) & np.isfinite(scan.directions).all(axis=1)
-    if mask is not None:
-        valid &= ~mask
-    order = np.argsort(scan.rings, kind="stable")
-    shots = order[valid[order]]
     stamps, poses = odometry.knots(scan.stamp, end)
     T_end_odom = inverse(poses[-1])
     knots = np.stack([T_end_odom @ T for T in poses])
-    turns = np.stack([log_so3(b[:3, :3] @ a[:3, :3].T) for a, b in pairwise(knots)] or [np.zeros(3)])
     knot_times = np.array([(stamp - scan.stamp) / NANOSECONDS for stamp in stamps])
-    origins, directions = deskew_shots(
-        np.ascontiguousarray(scan.directions, dtype=np.float64),
-        np.asarray(scan.times, dtype=np.float64),
-        shots,
-        np.asarray(scan.T_base_lidar, dtype=np.float64),
+    origins, directions, ranges, shots = deskew_shots(
+        np.ascontiguousarray(scan.directions, dtype=np.float32),
+        np.ascontiguousarray(scan.times, dtype=np.float32),
+        np.ascontiguousarray(scan.ranges, dtype=np.float32),
+        np.ascontiguousarray(scan.rings, dtype=np.uint8),
+        np.zeros(0, np.bool_) if mask is None else np.ascontiguousarray(mask, dtype=np.bool_),
+        min_range,
+        max_range,
+        np.ascontiguousarray(scan.T_base_lidar, dtype=np.float64),
         knot_times,
         knots,
-        turns,
     )
-    return Measurement(end, origins, directions, ranges[shots], np.full(len(shots), sigma), shots)
+    return Measurement(end, origins, directions, ranges, np.full(len(shots), sigma, np.float32), shots)
 
 
 def depth_measurement(frame: RgbdFrame, stride: int, max_range: float, mask: Bool | None = None) -> Measurement:
@@ -127,6 +119,12 @@ def depth_measurement(frame: RgbdFrame, stride: int, max_range: float, mask: Boo
     length = np.sqrt((rays * rays).sum(axis=1))
     T = np.asarray(frame.T_base_camera, dtype=float)
     directions = (rays / length[:, None]) @ T[:3, :3].T
-    origins = np.broadcast_to(T[:3, 3], directions.shape).copy()
     sigmas = np.asarray(axial_sigma(depth), dtype=np.float64) * length
-    return Measurement(frame.stamp, origins, directions, depth * length, sigmas, pixels)
+    return Measurement(
+        stamp=frame.stamp,
+        origins=np.tile(T[:3, 3], (len(depth), 1)).astype(np.float32),
+        directions=np.ascontiguousarray(directions, np.float32),
+        ranges=(depth * length).astype(np.float32),
+        sigmas=sigmas.astype(np.float32),
+        shots=pixels.astype(np.int32),
+    )

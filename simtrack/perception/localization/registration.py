@@ -7,15 +7,20 @@ posterior, that is one iterated extended Kalman update.
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from simtrack.contracts import Float64
-from simtrack.geometry.transforms import difference, perturb
+from simtrack.geometry.transforms import difference, orthonormal
+from simtrack.perception.localization.assessment import Assessment, assess, judge
 from simtrack.perception.localization.config import RegistrationConfig
 from simtrack.perception.localization.measurement import Measurement
 from simtrack.perception.localization.surface import MapSurface
+
+if TYPE_CHECKING:
+    from simtrack.perception.localization.solver import Rules
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +41,8 @@ class Registration:
     """Directions of the six that the data constrain."""
     steps: int
     """Gauss-Newton steps taken."""
+    assessment: Assessment | None = None
+    """Of the pose, if it was asked for."""
 
 
 def register(
@@ -47,6 +54,7 @@ def register(
     T_start: Float64 | None = None,
     systematic: Float64 | None = None,
     strides: tuple[int, ...] | None = None,
+    assessed: bool = False,
 ) -> Registration:
     """Register a measurement to the map.
 
@@ -59,97 +67,63 @@ def register(
         T_start: (4, 4) where to start from, the prediction if None.
         systematic: (6, 6) covariance, map frame, of errors that the shots share (what de-skewing leaves).
         strides: thinning of the shots, one entry a ray-casting iteration; the config's if None.
+        assessed: judge the pose too, by the last cast if the pose moved little since.
     """
-    T = np.array(T_prior if T_start is None else T_start)
+    from simtrack.perception.localization.solver import descend, map_information
+
+    T = np.array(T_prior if T_start is None else T_start, dtype=np.float64)
+    T_prior = np.ascontiguousarray(T_prior, dtype=np.float64)
     prior = np.linalg.inv(covariance + 1e-14 * np.eye(6))
-    reach = float(np.median(measurement.ranges)) if len(measurement) else 0.0
-    lever = np.array([1.0, 1.0, 1.0, reach, reach, reach])
+    reach = float(np.median(measurement.ranges[::8])) if len(measurement) else 0.0
     gate = _clip_gate(3.0 * _spread(covariance, reach), config)
     upright = floor_information(config)
     strides = config.strides if strides is None else strides
     info, map_info = np.zeros((6, 6)), np.zeros((6, 6))
-    observed = _Subspace(np.zeros((6, 0)), np.zeros((6, 0)))
+    basis = dual = np.zeros((6, 0))
     count, residual, steps, moved = 0, 0.0, 0, 0.0
-    for stride in strides:
-        shots = measurement.thinned(stride)
-        points, planes, weights, map_weights = _correspondences(T, shots, surface, gate, config)
-        count = len(points)
+    assessment: Assessment | None = None
+    turn = 0
+    while turn < len(strides):
+        last = turn == len(strides) - 1
+        view = surface.cast(T, measurement, strides[turn])
+        pairs, count = surface.pair(T, view, gate, config.pointing_sigma)
         if count < config.min_correspondences:
             break
-        T_cast = T
-        for _ in range(config.inner_iterations):
-            kernel = _kernel(T, points, planes, gate, config)
-            info, gradient, map_info, feigned, stats = _normal_equations(
-                T, points, planes, weights, map_weights, kernel
-            )
-            observed = _observed(info, feigned, stats, config)
-            info, gradient = _symmetric(observed.restrict(info)), observed.restrict(gradient)
-            A = info + prior + upright
-            b = gradient + prior @ difference(T, T_prior) + upright @ floor_deviation(T, surface.floor)
-            step = np.asarray(-np.linalg.solve(A, b), dtype=np.float64)
-            T = perturb(T, step)
-            steps += 1
-            residual = float(np.sqrt(stats[1] / max(stats[0], 1e-12)))
-            if float(np.abs(step * lever).max()) < config.step_tolerance:
-                break
+        T_cast, rules = T, _rules(config, reach, gate)
+        T, info, basis, dual, residual, kernel, taken = descend(
+            T_cast, pairs, count, T_prior, prior, upright, surface.floor, rules
+        )
+        T[:3, :3] = orthonormal(T[:3, :3])
+        steps += taken
         change = difference(T, T_cast)
         moved = float(np.linalg.norm(change[:3])) + reach * float(np.linalg.norm(change[3:]))
         gate = _clip_gate(2.0 * moved + 3.0 * residual, config, ceiling=gate)
+        if last:
+            map_info = map_information(pairs, count, T_cast, T, kernel)
+            assessment = judge(view) if assessed and moved < config.settled else None
+        turn = len(strides) - 1 if moved < config.settled and not last else turn + 1
     fused = _symmetric(np.linalg.inv(prior + upright + info))
     if count >= config.min_correspondences:
         own = np.diag([config.systematic_sigma**2] * 3 + [config.systematic_angle**2] * 3)
-        fused = _keep_shared_error(fused, map_info, observed, own if systematic is None else own + systematic)
+        fused = _keep_shared_error(fused, map_info, basis, dual, own if systematic is None else own + systematic)
     converged = count >= config.min_correspondences and moved < 0.5 * config.min_gate
-    return Registration(T, _symmetric(fused), converged, count, residual, observed.basis.shape[1], steps)
+    if assessed and assessment is None:
+        assessment = assess(measurement.thinned(7), surface, T)
+    return Registration(T, _symmetric(fused), converged, count, residual, basis.shape[1], steps, assessment)
 
 
-def _correspondences(
-    T: Float64, shots: Measurement, surface: MapSurface, gate: float, config: RegistrationConfig
-) -> tuple[Float64, Float64, Float64, Float64]:
-    from simtrack.perception.localization.kernels import correspond
+def _rules(config: RegistrationConfig, reach: float, gate: float) -> "Rules":
+    from simtrack.perception.localization.solver import Rules
 
-    hits, _ = surface.cast(T, shots)
-    points, planes, weights, map_weights, _ = correspond(
-        T,
-        shots.origins,
-        shots.directions,
-        shots.ranges,
-        shots.sigmas,
-        hits.distances,
-        hits.normals,
-        hits.faces,
-        hits.instances,
-        surface.normals,
-        surface.patches,
-        surface.instance,
-        gate,
-        config.pointing_sigma,
-        surface.patch_variance,
-        surface.counts,
+    return Rules(
+        iterations=config.inner_iterations,
+        tolerance=config.step_tolerance,
+        reach=reach,
+        gate=gate,
+        min_kernel=config.min_kernel,
+        normal_sigma=config.normal_sigma,
+        observability=config.observability,
     )
-    return points, planes, weights, map_weights
-
-
-def _normal_equations(
-    T: Float64, points: Float64, planes: Float64, weights: Float64, map_weights: Float64, kernel: float
-) -> tuple[Float64, Float64, Float64, Float64, Float64]:
-    from simtrack.perception.localization.kernels import normal_equations
-
-    return normal_equations(T, points, planes, weights, map_weights, kernel)
-
-
-@dataclass(frozen=True, slots=True)
-class _Subspace:
-    """The directions that the data constrain."""
-
-    basis: Float64
-    """(6, K), steps that stay in it: metres and radians a unit."""
-    dual: Float64
-    """(6, K), with ``dual.T @ basis = I``: reads the coordinates of a step."""
-
-    def restrict(self, gradient: Float64) -> Float64:
-        """Gradient or information with what acts on other directions taken out."""
-        return self.dual @ (self.basis.T @ gradient)
 
 
 def floor_information(config: RegistrationConfig) -> Float64:
@@ -165,37 +139,12 @@ def floor_deviation(T_map_base: Float64, floor: float) -> Float64:
     return np.array([0.0, 0.0, T_map_base[2, 3] - floor, -T_map_base[1, 2], T_map_base[0, 2], 0.0])
 
 
-def _kernel(T: Float64, points: Float64, planes: Float64, gate: float, config: RegistrationConfig) -> float:
-    """m, scale of the Geman-McClure kernel: anneals with the median distance, which outliers hardly touch."""
-    from simtrack.perception.localization.kernels import plane_distances
-
-    return float(min(max(3.0 * np.median(plane_distances(T, points[::3], planes[::3])), config.min_kernel), gate))
-
-
-def _observed(info: Float64, feigned: Float64, stats: Float64, config: RegistrationConfig) -> _Subspace:
-    """The directions that the data constrain (Zhang et al. 2016, with a threshold from the noise).
-
-    Normals that are off by `normal_sigma` at random give every direction some information, at most
-    ``normal_sigma^2 (sum w B B^T - sum w J J^T)``. A direction whose information is not well above that is not
-    observed: the pose stays as predicted there. Rotations are scaled by the RMS distance of the points, which makes
-    eigenvalues comparable.
-    """
-    lever = np.sqrt(max(stats[2] / max(stats[0], 1e-12), 1e-4))
-    scale = np.array([1.0, 1.0, 1.0, 1.0 / lever, 1.0 / lever, 1.0 / lever])
-    values, vectors = np.linalg.eigh(_symmetric(scale[:, None] * info * scale))
-    noise = config.normal_sigma**2 * (scale[:, None] * (feigned - info) * scale)
-    least = np.einsum("ik,ij,jk->k", vectors, noise, vectors)
-    good = vectors[:, values > config.observability * np.maximum(least, 1e-9)]
-    return _Subspace(scale[:, None] * good, good / scale[:, None])
-
-
-def _keep_shared_error(covariance: Float64, map_info: Float64, observed: _Subspace, own: Float64) -> Float64:
+def _keep_shared_error(covariance: Float64, map_info: Float64, basis: Float64, dual: Float64, own: Float64) -> Float64:
     """Covariance that is nowhere below what the errors leave that no averaging removes.
 
     The map's error is the same in every scan from about the same place, and the systematic ones (`own`) in every shot:
-    the filter must not average them away.
+    the filter must not average them away. `basis` and `dual` are (6, K), see `solver.observable`.
     """
-    basis, dual = observed.basis, observed.dual
     count = basis.shape[1]
     if not count:
         return covariance

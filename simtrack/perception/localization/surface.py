@@ -1,12 +1,14 @@
 """The static map as the localizer sees it: a ray-cast surface with denoised normals."""
 
+from dataclasses import dataclass
+from functools import lru_cache
+
 import numpy as np
 
 from simtrack.contracts import Bool, Float32, Float64, Int32, StaticMap
 from simtrack.errors import MeshError
-from simtrack.geometry.transforms import apply
 from simtrack.perception.localization.measurement import Measurement
-from simtrack.raycast import RayHits, RayScene, TriangleMesh
+from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
 
 MAX_BACK_FACES = 3
 """Surfaces in a row that a ray passes from behind."""
@@ -14,9 +16,57 @@ MAX_BACK_FACES = 3
 PASSED_OVER = 0.15
 """m: a shot that reaches through a surface is attributed to the next if it ends so close to that."""
 
+_PADDING = 1024
+"""Numbers of rays are rounded up to multiples of this, so that their packing is made seldom."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Shots aimed from a pose, and what each would have met; overwritten when the surface casts again."""
+
+    origins: Float32
+    """(N, 3), map frame, metres."""
+    directions: Float32
+    """(N, 3), map frame, unit."""
+    ranges: Float32
+    """(N,), metres, as measured."""
+    sigmas: Float32
+    """(N,), metres, standard deviation of the ranges."""
+    hits: RayHits
+    """Of N rays."""
+    passed: Bool
+    """(N,), True where the first surface was passed over."""
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+
+class _Room:
+    """Arrays for a number of rays that casts use again and again."""
+
+    def __init__(self, capacity: int) -> None:
+        from simtrack.perception.localization.kernels import Follow
+        from simtrack.perception.localization.solver import ROWS
+
+        self.capacity = capacity
+        self.origins, self.directions = np.empty((2, capacity, 3), np.float32)
+        self.ranges, self.sigmas = np.empty((2, capacity), np.float32)
+        self.hits = RayHits.empty(capacity)
+        self.passed = np.empty(capacity, np.bool_)
+        self.onward_origins, self.onward_directions = np.empty((2, capacity, 3), np.float32)
+        self.onward = RayHits.empty(capacity)
+        self.follow = Follow(
+            np.empty(capacity, np.int32),
+            np.empty(capacity, np.float32),
+            np.empty(capacity, np.int8),
+            np.empty(capacity, np.int8),
+        )
+        self.pairs = np.empty((ROWS, capacity), np.float32)
+        self.patches = np.empty(capacity, np.int32)
+
 
 class MapSurface:
-    """A static map in a ray-cast scene, which may hold other things too."""
+    """A static map in a ray-cast scene, which may hold other things too. Used by one thread at a time."""
 
     def __init__(
         self, static_map: StaticMap, scene: RayScene | None = None, instance: int = 0, correlation: float = 0.6
@@ -42,52 +92,90 @@ class MapSurface:
             scene.add(TriangleMesh(static_map.vertices, static_map.faces, source="static map"), instance=instance)
         self.scene = scene
         self.instance = instance
-        self.normals = smoothed_normals(static_map.vertices, static_map.faces)
-        self.patches, count = surface_patches(static_map.vertices, static_map.faces, self.normals, correlation)
+        normals = smoothed_normals(static_map.vertices, static_map.faces)
+        patches, count = surface_patches(static_map.vertices, static_map.faces, normals, correlation)
+        self._planes = np.column_stack([normals, patches]).astype(np.float32)  # side by side: one look-up a ray
+        self._counts = np.zeros(count, np.int32)
+        self._room: _Room | None = None
         self.patch_variance = static_map.noise**2
         """m^2, of the error that a patch's planes share."""
-        self.counts = np.zeros(count, np.int32)
         self.floor = float(np.median([room.floor for room in static_map.rooms])) if static_map.rooms else 0.0
         """m, height of the map's floor."""
 
-    def cast(self, T_map_base: Float64, shots: Measurement) -> tuple[RayHits, Bool]:
-        """What each shot would have met from `T_map_base`.
+    def cast(self, T_map_base: Float64, shots: Measurement, stride: int = 1) -> View:
+        """What every `stride`-th block of shots would have met from `T_map_base`.
 
         That is the first surface that faces the sensor, unless the shot was measured to reach through it and ends at
         the next one: then the first is something that has been taken away since the survey. Surfaces seen from behind
         do not count (the sensor would stand in a thing that is gone).
+        """
+        from simtrack.perception.localization.kernels import aim, thinned_count, unsettled
+
+        count = thinned_count(len(shots), stride)
+        room, padded = self._room_for(count), -(-count // _PADDING) * _PADDING
+        aimed = room.origins[:padded], room.directions[:padded], room.ranges[:padded], room.sigmas[:padded]
+        aim(T_map_base, shots.origins, shots.directions, shots.ranges, shots.sigmas, stride, aimed)
+        self.scene.cast_rays(aimed[0], aimed[1], packing=_in_order(padded), out=_first(room.hits, padded))
+        shots_aimed = room.origins[:count], room.directions[:count], room.ranges[:count], room.sigmas[:count]
+        view = View(*shots_aimed, _first(room.hits, count), room.passed[:count])
+        hits = view.hits
+        seen = view.directions, view.ranges, hits.distances, hits.normals
+        going_on = unsettled(count, *seen, 2.0 * PASSED_OVER, MAX_BACK_FACES, room.follow, view.passed)
+        while going_on:
+            going_on = self._go_on(view, room, going_on)
+        return view
+
+    def _go_on(self, view: View, room: _Room, count: int) -> int:
+        """Cast the rays of `room.follow` once more; returns how many are left."""
+        from simtrack.perception.localization.kernels import advance, aim_onward
+
+        origins, directions = room.onward_origins[:count], room.onward_directions[:count]
+        aim_onward(count, room.follow, view.origins, view.directions, origins, directions)
+        onward = self.scene.cast_rays(origins, directions, out=_first(room.onward, count))
+        rules = 2.0 * PASSED_OVER, PASSED_OVER, MAX_BACK_FACES
+        met = _arrays(view.hits), _arrays(onward)
+        return advance(count, view.directions, view.ranges, *met, *rules, room.follow, view.passed)
+
+    def pair(self, T_map_base: Float64, view: View, gate: float, pointing_sigma: float) -> tuple[Float32, int]:
+        """Correspondences of a view that was cast from `T_map_base` (4, 4), overwritten by the next ones.
+
+        Args:
+            T_map_base: pose of the cast.
+            view: what was met.
+            gate: m, the largest distance from the plane.
+            pointing_sigma: rad, of a shot's direction.
 
         Returns:
-            The hits, and (N,) True where the first surface was passed over.
+            (`solver.ROWS`, N) correspondences, and how many columns of them are filled.
         """
-        origins, directions = apply(T_map_base, shots.origins), shots.directions @ T_map_base[:3, :3].T
-        hits = self._first_facing(origins, directions)
-        passed = np.zeros(len(shots), bool)
-        through = np.flatnonzero(shots.ranges > hits.distances + 2.0 * PASSED_OVER)
-        if len(through):
-            start = hits.distances[through] + 1e-3
-            onward = self._first_facing(origins[through] + start[:, None] * directions[through], directions[through])
-            second = start + onward.distances
-            ends = np.abs(shots.ranges[through] - second) < PASSED_OVER
-            rows = through[ends]
-            passed[rows] = True
-            hits.distances[rows] = second[ends]
-            hits.normals[rows], hits.faces[rows] = onward.normals[ends], onward.faces[ends]
-            hits.instances[rows] = onward.instances[ends]
-        return hits, passed
+        from simtrack.perception.localization.solver import pair
 
-    def _first_facing(self, origins: Float64, directions: Float64) -> RayHits:
-        hits = self.scene.cast_rays(origins, directions)
-        for _ in range(MAX_BACK_FACES):
-            behind = np.flatnonzero(np.einsum("ij,ij->i", hits.normals, directions) > 0.0)
-            if not len(behind):
-                break
-            passed = hits.distances[behind] + 1e-3
-            onward = self.scene.cast_rays(origins[behind] + passed[:, None] * directions[behind], directions[behind])
-            hits.distances[behind] = passed + onward.distances
-            hits.normals[behind], hits.faces[behind] = onward.normals, onward.faces
-            hits.instances[behind] = onward.instances
-        return hits
+        room = self._room_for(len(view))
+        shots = view.origins, view.directions, view.ranges, view.sigmas
+        limits = gate, pointing_sigma, self.patch_variance
+        room_for_it = self._counts, room.patches, room.pairs
+        return room.pairs, pair(
+            T_map_base, shots, _arrays(view.hits), self._planes, self.instance, *limits, *room_for_it
+        )
+
+    def _room_for(self, count: int) -> _Room:
+        if self._room is None or self._room.capacity < count:
+            self._room = _Room(-(-count // _PADDING) * _PADDING)
+        return self._room
+
+
+def _first(hits: RayHits, count: int) -> RayHits:
+    return RayHits(hits.distances[:count], hits.normals[:count], hits.faces[:count], hits.instances[:count])
+
+
+def _arrays(hits: RayHits) -> tuple[Float32, Float32, Int32, Int32]:
+    return hits.distances, hits.normals, hits.faces, hits.instances
+
+
+@lru_cache(maxsize=64)
+def _in_order(count: int) -> RayBundle:
+    """Packing of rays that lie side by side in memory already."""
+    return RayBundle.from_directions(np.zeros((count, 3), np.float32))
 
 
 def surface_patches(vertices: Float32, faces: Int32, normals: Float64, size: float) -> tuple[Int32, int]:

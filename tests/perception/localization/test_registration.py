@@ -6,7 +6,6 @@ from simtrack.errors import InvalidValueError, MeshError
 from simtrack.geometry.transforms import difference, exp_so3, perturb, transform, transform_planar
 from simtrack.perception.localization.assessment import assess, lead
 from simtrack.perception.localization.config import LocalizerConfig, MotionConfig, RegistrationConfig, SearchConfig
-from simtrack.perception.localization.kernels import normal_equations
 from simtrack.perception.localization.measurement import Measurement, deskew
 from simtrack.perception.localization.motion import OdometryTrack
 from simtrack.perception.localization.registration import floor_deviation, register
@@ -33,14 +32,22 @@ def cost(T, points, planes, weights, kernel) -> float:
 
 
 def test_gradient_and_information_are_the_derivatives_of_the_robust_cost() -> None:
+    from simtrack.perception.localization.solver import ROWS, normal_equations
+
     rng = np.random.default_rng(1)
-    T = transform(exp_so3(rng.normal(size=3)), rng.normal(size=3))
+    T_cast = transform(exp_so3(rng.normal(size=3)), rng.normal(size=3))
+    T = perturb(T_cast, np.array([0.05, -0.1, 0.02, 0.03, -0.02, 0.08]))
     points = rng.normal(size=(200, 3)) * 3
     normals = rng.normal(size=(200, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     offsets = (normals * (points @ T[:3, :3].T + T[:3, 3])).sum(1) + 0.01 * rng.normal(size=200)
     planes, weights = np.column_stack([normals, offsets]), rng.uniform(1, 5, 200)
-    info, gradient, _, feigned, _ = normal_equations(T, points, planes, weights, weights, 0.05)
+    pairs = np.empty((ROWS, 300), np.float32)  # with columns that do not count
+    pairs[:3, :200], pairs[3:6, :200] = T_cast[:3, :3] @ points.T, normals.T
+    pairs[6, :200] = (normals * (points @ T_cast[:3, :3].T + T_cast[:3, 3])).sum(1) - offsets
+    pairs[7, :200], pairs[:, 200:] = weights, np.nan
+    motion, shift = T[:3, :3] @ T_cast[:3, :3].T - np.eye(3), T[:3, 3] - T_cast[:3, 3]
+    info, gradient, feigned, stats = normal_equations(pairs, pairs[7], 200, motion, shift, 0.05)
     step = 1e-6
     numeric = [
         (
@@ -50,16 +57,18 @@ def test_gradient_and_information_are_the_derivatives_of_the_robust_cost() -> No
         / (2 * step)
         for e in np.eye(6)
     ]
-    assert gradient == pytest.approx(np.array(numeric), rel=1e-5, abs=1e-4)
-    J = np.column_stack([normals, np.cross(points @ T[:3, :3].T, normals)])
-    e = (planes[:, :3] * (points @ T[:3, :3].T + T[:3, 3])).sum(1) - offsets
-    robust = weights * (0.05**2 / (0.05**2 + e**2)) ** 2
-    assert info == pytest.approx(J.T @ (robust[:, None] * J), rel=1e-9)
+    assert gradient == pytest.approx(np.array(numeric), rel=1e-4, abs=1e-3)
+    q = points @ T[:3, :3].T
+    J = np.column_stack([normals, np.cross(q, normals)])
+    e = (planes[:, :3] * (q + T[:3, 3])).sum(1) - offsets
+    kernel = (0.05**2 / (0.05**2 + e**2)) ** 2
+    assert info == pytest.approx(J.T @ ((weights * kernel)[:, None] * J), rel=1e-4, abs=1e-2)
     average = np.zeros((6, 6))  # over three orthogonal normals B n n^T B^T sums to B B^T
     for axis in np.eye(3):
-        K = np.column_stack([np.tile(axis, (200, 1)), np.cross(points @ T[:3, :3].T, axis)])
-        average += K.T @ (robust[:, None] * K)
-    assert feigned == pytest.approx(average, rel=1e-9, abs=1e-9)
+        K = np.column_stack([np.tile(axis, (200, 1)), np.cross(q, axis)])
+        average += K.T @ ((weights * kernel)[:, None] * K)
+    assert feigned == pytest.approx(average, rel=1e-4, abs=1e-2)
+    assert stats == pytest.approx([kernel.sum(), (kernel * e**2).sum(), (kernel * (q**2).sum(1)).sum()], rel=1e-4)
 
 
 def test_tilt_of_the_floor_prior_has_the_identity_as_its_derivative() -> None:
