@@ -51,6 +51,8 @@ class Bundle(NamedTuple):
     origin: np.ndarray
     """(3,) float32, map frame."""
     time: np.float32
+    coherent: bool
+    """Whether the rays of a packet meet the same parts of the scene."""
 
 
 class Rays(NamedTuple):
@@ -75,9 +77,13 @@ class Output(NamedTuple):
     instances: np.ndarray
 
 
-def run(serial: Any, parallel: Any, *arguments: Any) -> None:
-    """Call a kernel with `numba.get_num_threads()` threads; numba's own pool is entered by one thread at a time."""
-    if nb.get_num_threads() == 1:
+SMALL = 4096
+"""So few rays are faster cast by the calling thread alone."""
+
+
+def run(count: int, serial: Any, parallel: Any, *arguments: Any) -> None:
+    """Call a kernel for `count` rays with `numba.get_num_threads()` threads, which one caller at a time may use."""
+    if count <= SMALL or nb.get_num_threads() == 1:
         serial(*arguments)
         return
     with _POOL_LOCK:
@@ -208,7 +214,7 @@ def _read(lanes, packet, integers, order, base, table, turn, resting, distances,
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _bundle_chunk(chunk, lanes, scene, bundle, near, far, table, out):
     width = len(lanes)
-    packet, integers, valid, query = _new_packet(lanes, near, bundle.time, True)
+    packet, integers, valid, query = _new_packet(lanes, near, bundle.time, bundle.coherent)
     # Addresses as numbers; the arrays live until the end of the function because the loop uses them.
     p_valid, p_packet, p_query = valid.ctypes.data, packet.ctypes.data, query.ctypes.data
     packed, order, rotation = bundle.packed, bundle.order, bundle.rotation

@@ -1,6 +1,7 @@
 """A scene of mesh instances: cast rays at it, ask what is occluded and what lies nearest."""
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from threading import RLock
 from types import TracebackType
@@ -56,7 +57,8 @@ class RayScene:
         self._dirty = True
         self._top = 0
         self._closed = False
-        self._table: object = None
+        self._table: kernels.InstanceTable | None = None
+        self._table_stale, self._moved = True, set[int]()
         if not self.fallback:
             api = rtc.embree().api
             self._top = api.rtcNewScene(rtc.embree().device)
@@ -105,7 +107,7 @@ class RayScene:
             if not self.fallback:
                 self._attach(entry, number)
             self._instances[number] = entry
-            self._dirty = True
+            self._dirty = self._table_stale = True
         return number
 
     def remove(self, instance: int) -> None:
@@ -116,11 +118,29 @@ class RayScene:
                 rtc.embree().api.rtcDetachGeometry(self._top, instance)
                 rtc.embree().check("rtcDetachGeometry")
             del self._instances[instance]
+            self._moved.discard(instance)
             self._dirty = True
 
     def set_pose(self, instance: int, T_map_mesh: npt.ArrayLike) -> None:
         """Move an instance to the (4, 4) affine transform `T_map_mesh` and end any motion of it."""
         self._set_keys(instance, _checked_transforms(T_map_mesh, "T_map_mesh"))
+
+    def set_poses(self, instances: Sequence[int], T_map_mesh: npt.ArrayLike) -> None:
+        """Move several instances at once, see `set_pose`; `T_map_mesh` (N, 4, 4)."""
+        if not len(instances):
+            return
+        keys = _checked_transforms(T_map_mesh, "T_map_mesh")
+        if len(keys) != len(instances):
+            raise InvalidValueError("T_map_mesh", keys.shape, f"({len(instances)}, 4, 4)")
+        with self._lock:
+            entries = [self._get(instance) for instance in instances]
+            for k, (instance, entry) in enumerate(zip(instances, entries, strict=True)):
+                self._table_stale |= len(entry.keys) > 1
+                entry.keys = keys[k : k + 1]
+                if entry.geometry:
+                    _write_keys(entry)
+                    self._moved.add(instance)
+            self._dirty = True
 
     def set_motion(self, instance: int, T_keys: npt.ArrayLike) -> None:
         """Let an instance move during ray time 0..1.
@@ -161,7 +181,7 @@ class RayScene:
             if not self.fallback:
                 rtc.embree().api.rtcCommitScene(self._top)
                 rtc.embree().check("rtcCommitScene")
-                self._table = self._instance_table()
+                self._update_table()
             self._dirty = False
 
     # ------------------------------------------------------------------------------------------------------ queries
@@ -174,6 +194,7 @@ class RayScene:
         *,
         min_distance: float = 0.0,
         time: float = 0.0,
+        coherent: bool = True,
         out: RayHits | None = None,
     ) -> RayHits:
         """Cast a bundle from one sensor pose.
@@ -184,6 +205,8 @@ class RayScene:
             max_distance: farthest hit, in multiples of the directions' length.
             min_distance: nearest hit, likewise.
             time: of moving instances, 0..1.
+            coherent: whether neighbouring rays meet the same few triangles, as a whole image's do; False is faster
+                for rays some pixels apart on finely meshed things. The results are the same.
             out: results to overwrite and return (from `RayHits.empty`); saves the allocation.
         """
         T = _checked_transforms(T_map_sensor, "T_map_sensor")[0]
@@ -196,11 +219,11 @@ class RayScene:
             times = np.full(len(bundle), time)
             fallback.cast(self._instances, np.broadcast_to(origin, rays.shape), rays, times, *limits, hits)
         elif len(bundle):
-            rays = kernels.Bundle(bundle.packed, bundle.order, rotation, origin, np.float32(time))
+            rays = kernels.Bundle(bundle.packed, bundle.order, rotation, origin, np.float32(time), coherent)
             lanes = (0,) * bundle.packed.shape[2]
             output = kernels.Output(hits.distances, hits.normals, hits.faces, hits.instances)
             arguments = (lanes, self._top, rays, *limits, self._table, output)
-            kernels.run(kernels.cast_bundle, kernels.cast_bundle_parallel, *arguments)
+            kernels.run(len(bundle), kernels.cast_bundle, kernels.cast_bundle_parallel, *arguments)
         return hits
 
     def cast_rays(
@@ -236,7 +259,7 @@ class RayScene:
             lanes = (0,) * rtc.embree().packet_width
             output = kernels.Output(hits.distances, hits.normals, hits.faces, hits.instances)
             arguments = (lanes, self._top, kernels.Rays(*rays), *limits, packing is not None, self._table, output)
-            kernels.run(kernels.cast_rays, kernels.cast_rays_parallel, *arguments)
+            kernels.run(len(rays[0]), kernels.cast_rays, kernels.cast_rays_parallel, *arguments)
         return hits
 
     def occluded(
@@ -287,7 +310,7 @@ class RayScene:
 
             output = (found.points, found.distances, found.instances, found.faces)
             arguments = (self._top, closest.CALLBACK, queries, np.float32(max_distance), self._geometry(), output)
-            kernels.run(closest.closest, closest.closest_parallel, *arguments)
+            kernels.run(count, closest.closest, closest.closest_parallel, *arguments)
         return found
 
     # -------------------------------------------------------------------------------------------------- life and end
@@ -299,6 +322,7 @@ class RayScene:
                 self._release()
             self._closed = True
             self._instances.clear()
+            self._moved.clear()
 
     def __enter__(self) -> "RayScene":
         return self
@@ -333,9 +357,11 @@ class RayScene:
     def _set_keys(self, instance: int, keys: Float64) -> None:
         with self._lock:
             entry = self._get(instance)
+            self._table_stale |= len(entry.keys) > 1 or len(keys) > 1
             entry.keys = keys
             if entry.geometry:
                 _write_keys(entry)
+                self._moved.add(instance)
             self._dirty = True
 
     def _geometry(self) -> object:
@@ -349,21 +375,38 @@ class RayScene:
             poses[number] = entry.keys[0, :3]
         return closest.Geometry(buffers, poses)
 
-    def _instance_table(self) -> object:
+    def _update_table(self) -> None:
+        """Bring what kernels know of the instances up to date; most changes only move instances that are at rest."""
+        if self._table is None or self._table_stale:
+            self._table = self._instance_table()
+        elif self._moved:
+            rows = sorted(self._moved)
+            self._table.normal[rows] = _normal_matrices(np.array([self._instances[i].keys[0] for i in rows]))
+        self._table_stale = False
+        self._moved.clear()
+
+    def _instance_table(self) -> kernels.InstanceTable:
         size = max(self._instances, default=-1) + 1
         normal = np.zeros((size, 3, 3), np.float32)
         start, count = np.zeros(size, np.int32), np.ones(size, np.int32)
         keys: list[np.ndarray] = [np.zeros((0, 3, 3))]
         rows = 0
+        if self._instances:
+            first = np.array([entry.keys[0] for entry in self._instances.values()])
+            normal[list(self._instances)] = _normal_matrices(first)
         for number, entry in self._instances.items():
             linear = entry.keys[:, :3, :3]
-            matrix = np.linalg.inv(linear[0]).T
-            normal[number] = matrix / np.abs(matrix).max()
             if len(linear) > 1:
                 start[number], count[number] = rows, len(linear)
                 keys.append(linear)
                 rows += len(linear)
         return kernels.InstanceTable(normal, start, count, np.concatenate(keys).astype(np.float32))
+
+
+def _normal_matrices(transforms: Float64) -> Float64:
+    """(N, 3, 3) inverse transposes, scaled, of the linear parts of transforms (N, 4, 4)."""
+    matrices = np.linalg.inv(transforms[:, :3, :3]).transpose(0, 2, 1)
+    return np.asarray(matrices / np.abs(matrices).max(axis=(1, 2), keepdims=True))
 
 
 def _write_keys(entry: Instance) -> None:

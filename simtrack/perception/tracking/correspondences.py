@@ -8,8 +8,12 @@ model's edge and the depth discontinuity, which constrains what the visible face
 Everything here is in the camera frame. Sums run in a fixed order.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+
+from simtrack.contracts import Float32, Float64, Int32
 
 MISS, SUPPORTED, OCCLUDED, MISSING, INVALID = 0, 1, 2, 3, 4
 """What a ray that hits a model says: nothing hit; measured there; something in front; seen through; no reading."""
@@ -19,6 +23,63 @@ UNKNOWN_PIXEL = -2
 
 FIELDS = 5
 """Number of ray verdicts counted for each instance (columns of the counts)."""
+
+
+class Points(NamedTuple):
+    """Pairs of measured and model points, camera frame; room for as many as there are rays."""
+
+    measured: Float64
+    """(M, 3), metres."""
+    model: Float64
+    """(M, 3), metres."""
+    normal: Float64
+    """(M, 3), unit vectors."""
+    weight: Float64
+    """(M,), inverse variance along the normal, 1/m^2."""
+    owner: Int32
+    """(M,), row of the instance."""
+
+    @classmethod
+    def room(cls, count: int) -> "Points":
+        """Empty buffers for `count` pairs."""
+        vectors = (np.empty((count, 3)) for _ in range(3))
+        return cls(*vectors, np.empty(count), np.empty(count, np.int32))
+
+
+class Edges(NamedTuple):
+    """Silhouette pixels with the depth discontinuities that they belong to; room for as many as there are rays."""
+
+    point: Float64
+    """(M, 3) model point, camera frame, metres."""
+    direction: Float64
+    """(M, 2) outward direction in the image, unit vectors."""
+    offset: Float64
+    """(M,) pixels that the silhouette has to move along it."""
+    weight: Float64
+    """(M,), 1/px^2."""
+    owner: Int32
+    """(M,), row of the instance."""
+
+    @classmethod
+    def room(cls, count: int) -> "Edges":
+        """Empty buffers for `count` pairs."""
+        return cls(
+            np.empty((count, 3)), np.empty((count, 2)), np.empty(count), np.empty(count), np.empty(count, np.int32)
+        )
+
+
+class ModelImages(NamedTuple):
+    """What the rays of a cast met, as images; untouched pixels hold `UNKNOWN_PIXEL`."""
+
+    depth: Float32
+    """(H, W), metres, 0 = miss."""
+    instance: Int32
+    """(H, W), row, -1 = miss."""
+
+    @classmethod
+    def empty(cls, height: int, width: int) -> "ModelImages":
+        """Images without any ray."""
+        return cls(np.zeros((height, width), np.float32), np.full((height, width), UNKNOWN_PIXEL, np.int32))
 
 
 @njit(cache=True, nogil=True)
@@ -37,76 +98,120 @@ def axial_variance(z: float, cosine: float, pixel_noise: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def model_images(pixels, distances, instances, model_depth, model_instance):
-    """Scatter cast rays into images: `model_depth` (H, W) metres (0 = miss), `model_instance` (H, W) (-1 = miss)."""
-    width = model_depth.shape[1]
+def image_windows(corners, poses, camera, size, margin, windows):
+    """Pixel boxes of the projected bounding boxes.
+
+    `corners` (K, 8, 3), object frames; `poses` (K, 4, 4) T_camera_object; `size` (width, height). Output: `windows`
+    (K, 4), half-open (u0, v0, u1, v1) with a `margin` of pixels, empty where an instance is out of view or reaches
+    behind the camera.
+    """
+    for k in range(poses.shape[0]):
+        T = poses[k]
+        u_low, v_low, u_high, v_high = np.inf, np.inf, -np.inf, -np.inf
+        windows[k] = 0
+        nearest = np.inf
+        for c in range(8):
+            p = corners[k, c]
+            z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+            nearest = min(nearest, z)
+            if z < 0.05:
+                break
+            u = camera[0] * (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z + camera[2]
+            v = camera[1] * (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z + camera[3]
+            u_low, v_low, u_high, v_high = min(u_low, u), min(v_low, v), max(u_high, u), max(v_high, v)
+        if nearest < 0.05:
+            continue
+        u0, v0 = max(0.0, np.trunc(u_low) - margin), max(0.0, np.trunc(v_low) - margin)
+        u1 = min(float(size[0]), np.trunc(u_high) + margin + 2)
+        v1 = min(float(size[1]), np.trunc(v_high) + margin + 2)
+        if u0 < u1 and v0 < v1:
+            windows[k, 0], windows[k, 1], windows[k, 2], windows[k, 3] = int(u0), int(v0), int(u1), int(v1)
+
+
+@njit(cache=True, nogil=True)
+def rows_of(instances, row, rows):
+    """Rows (N,) of the instances that rays hit, by the table `row`; -1 = miss."""
+    for i in range(instances.shape[0]):
+        rows[i] = row[instances[i]] if instances[i] >= 0 else -1
+
+
+@njit(cache=True, nogil=True)
+def draw(pixels, distances, rows, images):
+    """Write cast rays into images."""
+    depth, instance = images.depth.reshape(-1), images.instance.reshape(-1)
     for i in range(pixels.shape[0]):
-        v, u = pixels[i] // width, pixels[i] % width
-        model_instance[v, u] = instances[i]
-        model_depth[v, u] = distances[i] if instances[i] >= 0 else 0.0
+        instance[pixels[i]] = rows[i]
+        depth[pixels[i]] = distances[i] if rows[i] >= 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def erase(pixels, images):
+    """Make images untouched again."""
+    instance = images.instance.reshape(-1)
+    for i in range(pixels.shape[0]):
+        instance[pixels[i]] = UNKNOWN_PIXEL
 
 
 @njit(cache=True, nogil=True)
 def point_correspondences(
-    pixels, distances, normals, instances, depth, camera, strides, gates, model_sigma, focal_baseline,
-    measured, model, normal, weight, owner, counts,
+    pixels, directions, distances, normals, rows, readings, width, strides, gate, sigma, model_sigma, pixel_noise,
+    lateral, points, counts,
 ):  # fmt: skip
     """Pair measured points with model points along the viewing rays; returns the number of pairs.
 
+    Camera or lidar: a ray's point is its distance times its direction.
+
     Args:
-        pixels: (N,) flat indices of the rays' pixels.
-        distances: (N,) model depth along the optical axis, metres, inf = miss.
-        normals: (N, 3) unit normals of the models.
-        instances: (N,) row of the model hit, -1 = miss.
-        depth: (H, W) measured, metres, 0 = no reading.
-        camera: (4,) fx, fy, cx, cy.
+        pixels: (N,) index of each ray's reading.
+        directions: (N, 3); z = 1 for a camera, unit vectors for a lidar.
+        distances: (N,) of the models, in multiples of the directions, inf = miss.
+        normals: (N, 3) unit normals of the models, sensor frame.
+        rows: (N,) row of the model hit; anything outside of 0..K-1 does not take part.
+        readings: (P,) measured, in multiples of the directions, 0 = no reading.
+        width: of the image, pixels.
         strides: (K,) pixel grid that each instance is sampled on.
-        gates: (K,) largest distance along the normal, metres.
+        gate: largest distance along the normal, metres; 3 sigma of the sensor are added.
+        sigma: standard deviation of the readings, metres; 0: that of a depth camera, see `axial_variance`.
         model_sigma: surface error of the models, metres.
-        focal_baseline: focal length times baseline of the depth sensor, px m.
-        measured: (M, 3) output, metres.
-        model: (M, 3) output, metres.
-        normal: (M, 3) output, unit vectors.
-        weight: (M,) output, inverse variance along the normal, 1/m^2.
-        owner: (M,) output, row of the instance.
-        counts: (K, FIELDS) output, rays by verdict.
+        pixel_noise: focal length times baseline of a depth camera, px m.
+        lateral: standard deviation across the ray in multiples of the distance.
+        points: output.
+        counts: (K, FIELDS) output, rays by verdict, added to.
 
     """
-    width = depth.shape[1]
+    measured, model, normal, weight, owner = points
     found = 0
     for i in range(pixels.shape[0]):
-        k = instances[i]
-        if k < 0:
+        k = rows[i]
+        if k < 0 or k >= strides.shape[0]:
             continue
-        v, u = pixels[i] // width, pixels[i] % width
+        v = pixels[i] // width
+        u = pixels[i] - v * width
         if u % strides[k] != 0 or v % strides[k] != 0:
             continue
-        x, y, z = (u - camera[2]) / camera[0], (v - camera[3]) / camera[1], distances[i]
-        d = depth[v, u]
+        x, y, w = float(directions[i, 0]), float(directions[i, 1]), float(directions[i, 2])
+        z = float(distances[i])
+        d = float(readings[pixels[i]])
         if d <= 0.0:
             counts[k, INVALID] += 1
             continue
-        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
-        along = nx * x + ny * y + nz
-        length = np.sqrt(x * x + y * y + 1.0)
-        cosine = abs(along) / length
+        nx, ny, nz = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
+        along = nx * x + ny * y + nz * w
+        cosine = abs(along) / np.sqrt(x * x + y * y + w * w)
         delta = d - z
-        variance = axial_variance(z, cosine, focal_baseline)
+        variance = sigma * sigma if sigma > 0.0 else axial_variance(z, cosine, pixel_noise)
         slack = 3.0 * np.sqrt(variance)
-        gate = gates[k] + slack * cosine
-        if abs(delta * along) > gate or abs(delta) > 3.0 * gate + slack:
-            if delta < 0.0:
-                counts[k, OCCLUDED] += 1
-            else:
-                counts[k, MISSING] += 1
+        widest = gate + slack * cosine
+        if abs(delta * along) > widest or abs(delta) > 3.0 * widest + slack:
+            counts[k, OCCLUDED if delta < 0.0 else MISSING] += 1
             continue
         counts[k, SUPPORTED] += 1
         if cosine < 0.17:
             continue
-        lateral = 0.4 * z / camera[0]
-        noise = variance * along * along + lateral * lateral * (1.0 - cosine * cosine) + model_sigma * model_sigma
-        measured[found, 0], measured[found, 1], measured[found, 2] = d * x, d * y, d
-        model[found, 0], model[found, 1], model[found, 2] = z * x, z * y, z
+        across = lateral * z
+        noise = variance * along * along + across * across * (1.0 - cosine * cosine) + model_sigma * model_sigma
+        measured[found, 0], measured[found, 1], measured[found, 2] = d * x, d * y, d * w
+        model[found, 0], model[found, 1], model[found, 2] = z * x, z * y, z * w
         normal[found, 0], normal[found, 1], normal[found, 2] = nx, ny, nz
         weight[found], owner[found] = 1.0 / noise, k
         found += 1
@@ -141,21 +246,20 @@ def _edge_offset(depth, model_depth, model_instance, k, u, v, du, dv, z, reach, 
 
 
 @njit(cache=True, nogil=True)
-def edge_correspondences(
-    pixels, instances, depth, model_depth, model_instance, camera, strides, reach, step_depth, focal_baseline,
-    point, direction, offset, weight, owner,
-):  # fmt: skip
+def edge_correspondences(pixels, rows, depth, images, camera, strides, reach, step_depth, focal_baseline, edges, seen):
     """Pair the models' silhouettes with depth discontinuities; returns the number of pairs.
 
-    For a silhouette pixel with outward image direction d the measured discontinuity is sought along d. Outputs:
-    `point` (M, 3) model point, metres; `direction` (M, 2) d; `offset` (M,) pixels that the silhouette has to move
-    along d; `weight` (M,) 1/px^2; `owner` (M,) row of the instance.
+    For a silhouette pixel with outward image direction d the measured discontinuity is sought along d, up to `reach`
+    pixels away. `images` are those of this cast, `rows` (N,) as for `point_correspondences`. Output: `edges`, and
+    `seen` (K,), pairs of each instance, added to.
     """
+    point, direction, offset, weight, owner = edges
+    model_depth, model_instance = images
     height, width = depth.shape
     found = 0
     for i in range(pixels.shape[0]):
-        k = instances[i]
-        if k < 0 or found >= offset.shape[0]:
+        k = rows[i]
+        if k < 0 or k >= strides.shape[0]:
             continue
         v, u = pixels[i] // width, pixels[i] % width
         s = strides[k]
@@ -195,22 +299,24 @@ def edge_correspondences(
         offset[found] = shift - 0.5 * s
         weight[found] = 1.0 / (0.64 + 0.1 * s * s)
         owner[found] = k
+        seen[k] += 1
         found += 1
     return found
 
 
 @njit(cache=True, nogil=True)
-def point_normal_equations(measured, model, normal, weight, owner, centres, rotations, shifts, kernel, H, g, stats):
-    """Accumulate robust point-to-plane normal equations of every instance.
+def point_normal_equations(points, count, centres, rotations, shifts, kernel, H, g, stats):
+    """Accumulate robust point-to-plane normal equations of every instance from the first `count` pairs.
 
     The models have moved since the cast by ``m' = c + R (m - c) + t`` about their `centres` (K, 3); `rotations` (K, 3,
-    3), `shifts` (K, 3). Residual ``r = n . (p - m')``, Geman-McClure weights with scale `kernel` (K,) in standard
-    deviations.
+    3), `shifts` (K, 3). Residual ``r = n . (p - m')``, Geman-McClure weights, scale `kernel` in standard deviations.
     Outputs: `H` (K, 6, 6) and `g` (K, 6) with ``H xi = g``; `stats` (K, 3): weighted pairs, sum of w r^2 in units of
     the variance, sum of squared residuals of inliers in m^2.
     """
+    measured, model, normal, weight, owner = points
+    scale = kernel * kernel
     J = np.empty(6)
-    for i in range(owner.shape[0]):
+    for i in range(count):
         k = owner[i]
         R = rotations[k]
         ax, ay, az = model[i, 0] - centres[k, 0], model[i, 1] - centres[k, 1], model[i, 2] - centres[k, 2]
@@ -226,7 +332,6 @@ def point_normal_equations(measured, model, normal, weight, owner, centres, rota
             + nz * (measured[i, 2] - centres[k, 2] - shifts[k, 2] - bz)
         )
         squared = r * r * weight[i]
-        scale = kernel[k] * kernel[k]
         robust = (scale / (scale + squared)) ** 2
         w = weight[i] * robust
         J[0], J[1], J[2] = nx, ny, nz
@@ -241,16 +346,15 @@ def point_normal_equations(measured, model, normal, weight, owner, centres, rota
 
 
 @njit(cache=True, nogil=True)
-def edge_normal_equations(
-    point, direction, offset, weight, owner, camera, centres, rotations, shifts, kernel, H, g, stats
-):  # fmt: skip
+def edge_normal_equations(edges, count, camera, centres, rotations, shifts, kernel, H, g):
     """Accumulate the normal equations of silhouette offsets, which move the models' edges in the image.
 
-    As `point_normal_equations`; residual in pixels ``r = offset - d . (proj(m') - proj(m))``; `stats` (K, 2): pairs,
-    sum of w r^2.
+    As `point_normal_equations`; residual in pixels ``r = offset - d . (proj(m') - proj(m))``.
     """
+    point, direction, offset, weight, owner = edges
+    scale = kernel * kernel
     J = np.empty(6)
-    for i in range(owner.shape[0]):
+    for i in range(count):
         k = owner[i]
         R = rotations[k]
         x, y, z = point[i, 0], point[i, 1], point[i, 2]
@@ -270,7 +374,6 @@ def edge_normal_equations(
         px, py = du * camera[0] / mz, dv * camera[1] / mz
         pz = -(px * mx + py * my) / mz
         squared = r * r * weight[i]
-        scale = kernel * kernel
         robust = (scale / (scale + squared)) ** 2
         w = weight[i] * robust
         J[0], J[1], J[2] = px, py, pz
@@ -279,18 +382,17 @@ def edge_normal_equations(
             g[k, a] += w * J[a] * r
             for b in range(a, 6):
                 H[k, a, b] += w * J[a] * J[b]
-        stats[k, 0] += robust
-        stats[k, 1] += robust * squared
 
 
 @njit(cache=True, nogil=True)
-def umeyama_sums(measured, model, normal, owner, centres, rotations, shifts, count, mean_p, mean_q, cross):
-    """First and second moments of the correspondences for a closed-form rigid fit of every instance.
+def umeyama_sums(points, pairs, centres, rotations, shifts, count, mean_p, mean_q, cross):
+    """First and second moments of the first `pairs` correspondences for a closed-form rigid fit of every instance.
 
     The model's partner ``q`` of a measured point ``p`` is its foot on the tangent plane at the ray's hit. Outputs are
     plain sums: `count` (K,), `mean_p`, `mean_q` (K, 3), `cross` (K, 3, 3) of ``p q^T``, about `centres`.
     """
-    for i in range(owner.shape[0]):
+    measured, model, normal, _, owner = points
+    for i in range(pairs):
         k = owner[i]
         R = rotations[k]
         b, n, p = np.empty(3), np.empty(3), np.empty(3)

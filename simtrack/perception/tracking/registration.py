@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, Int32
+from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import orthonormal
 from simtrack.perception.tracking import correspondences as kernels
 from simtrack.perception.tracking import solver
 from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
@@ -65,6 +65,8 @@ class RegistrationConfig:
     """Solver steps on the same correspondences (the paper: 10 Umeyama fits)."""
     tolerance: float = 5e-5
     """An instance that an outer iteration moves by less than this has converged, metres of surface."""
+    settled: float = 1e-3
+    """... and by less than this needs no other coarse iteration."""
     max_shift: float = 0.01
     """Longest solver step, metres: correspondences are only valid near where they were cast."""
     max_turn: float = np.deg2rad(2.0)
@@ -149,17 +151,18 @@ class RegistrationResult:
 
 
 class Registration:
-    """Registers instances in one scene; owns the scene and its image buffers.
+    """Registers instances in one scene; owns the scene and the buffers of its kernels.
 
-    The scene is kept in the camera frame, so that errors of the robot's own pose do not enter.
+    The scene is kept in the camera frame, so that errors of the robot's own pose do not enter. Work is done on arrays
+    over all instances; those that have come to rest are not cast again, and only occlude.
     """
 
     def __init__(self, config: RegistrationConfig | None = None) -> None:
         self.config = config or RegistrationConfig()
         self._scene = RayScene()
         self._models: dict[int, TrackedModel] = {}
-        self._depth_image = np.zeros((0, 0), np.float32)
-        self._instance_image = np.zeros((0, 0), np.int32)
+        self._images = kernels.ModelImages.empty(0, 0)
+        self._points, self._edges = kernels.Points.room(0), kernels.Edges.room(0)
 
     def add(self, instance: int, model: TrackedModel) -> None:
         """Put an instance of a model into the scene."""
@@ -197,22 +200,20 @@ class Registration:
             A result for each instance in `poses` whose box projects into the image.
 
         """
-        current = self._place(intrinsics, poses, fixed)
-        strides = self._strides(intrinsics, current)
-        if not current:
+        config, steps = self.config, schedule or self.config.schedule
+        batch = self._batch(depth, intrinsics, poses, fixed)
+        if batch is None:
             return {}
-        batch = None
-        for step in schedule or self.config.schedule:
-            grid = {i: stride * step.coarsen for i, stride in strides.items()}
+        for number, step in enumerate(steps):
+            # What the last step hardly moved needs no more coarse ones.
+            last = number == len(steps) - 1
+            batch.active[:] = True if last or number == 0 else batch.moved > config.settled
             for _ in range(step.repeats):
-                batch = _Batch(self, depth, intrinsics, current, grid, step)
-                batch.solve(self.config.inner_iterations)
-                current = batch.poses()
-                for instance, T in current.items():
-                    self._scene.set_pose(instance, T)
-                if batch.largest_step() < self.config.tolerance:
+                if not batch.active.any():
                     break
-        return batch.results() if batch is not None else {}
+                self._iterate(batch, step, config.inner_iterations)
+                batch.active &= batch.moved > config.tolerance
+        return batch.results(config)
 
     def assess(
         self,
@@ -222,12 +223,11 @@ class Registration:
         fixed: Mapping[int, Float64] | None = None,
     ) -> dict[int, RegistrationResult]:
         """Judge poses against a depth image without moving them: a single cast at the last gate."""
-        current = self._place(intrinsics, poses, fixed)
-        if not current:
+        batch = self._batch(depth, intrinsics, poses, fixed)
+        if batch is None:
             return {}
-        batch = _Batch(self, depth, intrinsics, current, self._strides(intrinsics, current), self.config.schedule[-1])
-        batch.solve(0)
-        return batch.results()
+        self._iterate(batch, self.config.schedule[-1], 0)
+        return batch.results(self.config)
 
     def depth_differences(
         self,
@@ -239,190 +239,181 @@ class Registration:
         fixed: Mapping[int, Float64] | None = None,
     ) -> Float64:
         """Measured minus model depth on the rays that hit an instance first, metres, where within `reach`."""
-        if not self._place(intrinsics, {instance: T_camera_object}, fixed):
+        batch = self._batch(depth, intrinsics, {instance: T_camera_object}, fixed)
+        if batch is None:
             return np.empty(0)
-        window = self._window(instance, T_camera_object, intrinsics)
-        assert window is not None
-        hits, pixels = self._cast(intrinsics, [(window, self._stride(window))])
-        out = np.empty(len(pixels))
-        count = kernels.ray_differences(pixels, hits.distances, hits.instances, depth, instance, reach, out)
+        bundle, hits = self._cast(batch, 1)
+        out = np.empty(len(bundle))
+        count = kernels.ray_differences(bundle.pixels, hits.distances, hits.instances, depth, instance, reach, out)
         return out[:count]
 
     def explained(self, depth: Float32, intrinsics: CameraIntrinsics, instance: int, T_camera_object: Float64) -> Bool:
         """(H, W), True where a lone instance at a pose explains the measured depth."""
         out = np.zeros(depth.shape, bool)
-        for other in self._models:
-            self._scene.set_enabled(other, other == instance)
-        self._scene.set_pose(instance, T_camera_object)
-        window = self._window(instance, T_camera_object, intrinsics)
-        if window is not None:
-            hits, pixels = self._cast(intrinsics, [(window, 2)])
-            measured = depth.reshape(-1)[pixels]
+        batch = self._batch(depth, intrinsics, {instance: T_camera_object}, None)
+        if batch is not None:
+            batch.strides[:] = 2
+            bundle, hits = self._cast(batch, 1)
+            measured = depth.reshape(-1)[bundle.pixels]
             variance = kernels.axial_variance(float(T_camera_object[2, 3]), 0.8, self.config.focal_baseline)
             reach = self.config.schedule[-1].gate + 3.0 * np.sqrt(variance)
-            out.reshape(-1)[pixels] = (measured > 0.0) & (np.abs(measured - hits.distances) < reach)
+            out.reshape(-1)[bundle.pixels] = (measured > 0.0) & (np.abs(measured - hits.distances) < reach)
         return out
 
-    def _place(
-        self, intrinsics: CameraIntrinsics, poses: Mapping[int, Float64], fixed: Mapping[int, Float64] | None
-    ) -> dict[int, Float64]:
-        """Show the given instances and no others; returns those of `poses` that project into the image."""
-        current = {i: T for i, T in poses.items() if self._window(i, T, intrinsics) is not None}
-        shown = {**(fixed or {}), **current}
-        for instance in self._models:
-            self._scene.set_enabled(instance, instance in shown)
-            if instance in shown:
-                self._scene.set_pose(instance, shown[instance])
-        return current
-
-    def _window(self, instance: int, T: Float64, intrinsics: CameraIntrinsics) -> tuple[int, int, int, int] | None:
-        """Half-open pixel box (u0, v0, u1, v1) of the instance's box with a margin; None if it is out of view."""
-        p = self._models[instance].corners @ T[:3, :3].T + T[:3, 3]
-        if p[:, 2].min() < 0.05:
-            return None
-        u = intrinsics.fx * p[:, 0] / p[:, 2] + intrinsics.cx
-        v = intrinsics.fy * p[:, 1] / p[:, 2] + intrinsics.cy
-        margin = 4
-        u0, u1 = max(0, int(u.min()) - margin), min(intrinsics.width, int(u.max()) + margin + 2)
-        v0, v1 = max(0, int(v.min()) - margin), min(intrinsics.height, int(v.max()) + margin + 2)
-        return (u0, v0, u1, v1) if u0 < u1 and v0 < v1 else None
-
-    def _stride(self, window: tuple[int, int, int, int]) -> int:
-        area = (window[2] - window[0]) * (window[3] - window[1])
-        return 1 if area <= self.config.max_rays else 2 if area <= 4 * self.config.max_rays else 4
-
-    def _strides(self, intrinsics: CameraIntrinsics, poses: Mapping[int, Float64]) -> dict[int, int]:
-        """Pixel grid of every instance; chosen once for a registration, so that iterations do not alternate."""
-        windows = {i: self._window(i, T, intrinsics) for i, T in poses.items()}
-        return {i: self._stride(w) for i, w in windows.items() if w is not None}
-
-    def _cast(
-        self, intrinsics: CameraIntrinsics, windows: Sequence[tuple[tuple[int, int, int, int], int]]
-    ) -> tuple[RayHits, Int32]:
-        shape = (intrinsics.height, intrinsics.width)
-        if self._depth_image.shape != shape:
-            self._depth_image = np.zeros(shape, np.float32)
-            self._instance_image = np.full(shape, kernels.UNKNOWN_PIXEL, np.int32)
-        bundle = RayBundle.from_windows(intrinsics, [w for w, _ in windows], [stride for _, stride in windows])
-        assert bundle.pixels is not None
-        return self._scene.cast(bundle, np.eye(4)), bundle.pixels
-
-
-class _Batch:
-    """One outer iteration: a cast, its correspondences, and solver steps for every instance."""
-
-    def __init__(
+    def _batch(
         self,
-        registration: Registration,
         depth: Float32,
         intrinsics: CameraIntrinsics,
         poses: Mapping[int, Float64],
-        strides: Mapping[int, int],
-        step: Step,
-    ) -> None:
-        config = registration.config
-        self._config, self._step = config, step
-        self._poses = poses
-        self._instances = list(poses)
-        self._models = [registration._models[i] for i in self._instances]
-        self._camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
-        windows = [(w, strides[i]) for i, T in poses.items() if (w := registration._window(i, T, intrinsics))]
-        self._strides = np.array([strides[i] for i in poses], np.int32)
-        hits, pixels = registration._cast(intrinsics, windows)
-        K = len(self._instances)
-        self._centres = np.array([T[:3, 3] for T in poses.values()])
-        self._rotations = np.tile(np.eye(3), (K, 1, 1))
-        self._shifts = np.zeros((K, 3))
-        self._correspond(registration, hits, pixels, depth)
-        self._radii = np.array([m.radius for m in self._models])
-        self._covariance, self._constrained = np.zeros((K, 6, 6)), np.zeros(K, np.int64)
-        self._stats = np.zeros((K, 3))
+        fixed: Mapping[int, Float64] | None,
+    ) -> "_Batch | None":
+        """Show the given instances and no others; take up those of `poses` that project into the image."""
+        batch = _Batch(depth, intrinsics, self._models, poses, self.config.max_rays)
+        shown = {**(fixed or {}), **dict(zip(batch.instances, batch.poses, strict=True))}
+        for instance in self._models:
+            self._scene.set_enabled(instance, instance in shown)
+        self._scene.set_poses(list(shown), list(shown.values()))
+        if self._images.depth.shape != depth.shape:
+            self._images = kernels.ModelImages.empty(*depth.shape)
+        return batch if batch.instances else None
 
-    def _correspond(self, registration: Registration, hits: RayHits, pixels: Int32, depth: Float32) -> None:
-        config, K, N = self._config, len(self._instances), len(pixels)
-        row_of = np.full(max([*registration._models, 0]) + 1, -1, np.int32)
-        row_of[self._instances] = np.arange(K, dtype=np.int32)
+    def _cast(self, batch: "_Batch", coarsen: int) -> tuple[RayBundle, RayHits]:
+        """Cast the rays of the active instances' windows."""
+        windows, strides = batch.windows[batch.active], coarsen * batch.strides[batch.active]
+        bundle = RayBundle.from_windows(batch.intrinsics, windows.tolist(), strides.tolist())
+        # Rays a few pixels apart meet other triangles of a fine mesh: they are no coherent packets.
+        hits = self._scene.cast(bundle, np.eye(4), coherent=False)
+        if len(bundle) > len(self._points.weight):
+            self._points, self._edges = kernels.Points.room(len(bundle)), kernels.Edges.room(len(bundle))
+        return bundle, hits
+
+    def _iterate(self, batch: "_Batch", step: Step, iterations: int) -> None:
+        """One outer iteration of the active instances: a cast, its correspondences, and solver steps on them."""
+        config, count = self.config, len(batch.instances)
+        batch.locate()
+        bundle, hits = self._cast(batch, step.coarsen)
+        pixels = bundle.pixels
+        assert pixels is not None
         # Occluders that are not registered keep their rays: they are neither misses nor rows.
-        rows = np.where(hits.instances >= 0, row_of[hits.instances], -1).astype(np.int32)
-        seen = np.where((hits.instances >= 0) & (rows < 0), np.int32(K), rows)
-        kernels.model_images(pixels, hits.distances, seen, registration._depth_image, registration._instance_image)
-        gates = np.full(K, self._step.gate)
-        self._measured, self._model, self._normal = (np.empty((N, 3)) for _ in range(3))
-        self._weight, self._owner = np.empty(N), np.empty(N, np.int32)
-        self._counts = np.zeros((K, kernels.FIELDS), np.int64)
-        count = kernels.point_correspondences(
-            pixels, hits.distances, hits.normals, rows, depth, self._camera, self._strides, gates, config.model_sigma,
-            config.focal_baseline, self._measured, self._model, self._normal, self._weight, self._owner, self._counts,
+        row = np.full(max(self._models) + 1, count, np.int32)
+        row[batch.instances] = np.where(batch.active, np.arange(count), count)
+        rows = np.empty(len(bundle), np.int32)
+        kernels.rows_of(hits.instances, row, rows)
+        batch.counts[batch.active], batch.edges[batch.active] = 0, 0
+        strides = step.coarsen * batch.strides
+        pairs = kernels.point_correspondences(
+            pixels, bundle.directions, hits.distances, hits.normals, rows, batch.depth.reshape(-1),
+            batch.depth.shape[1], strides, step.gate, 0.0, config.model_sigma, config.focal_baseline,
+            0.4 / batch.camera[0], self._points, batch.counts,
         )  # fmt: skip
-        self._measured, self._model, self._normal = self._measured[:count], self._model[:count], self._normal[:count]
-        self._weight, self._owner = self._weight[:count], self._owner[:count]
-        M = 0 if self._step.silhouettes == "never" else N
-        self._edge_point, self._edge_direction = np.empty((M, 3)), np.empty((M, 2))
-        self._edge_offset, self._edge_weight, self._edge_owner = np.empty(M), np.empty(M), np.empty(M, np.int32)
-        count = 0
-        if M:
-            count = kernels.edge_correspondences(
-                pixels, rows, depth, registration._depth_image, registration._instance_image, self._camera,
-                self._strides, self._step.edge_reach, config.edge_step, config.focal_baseline,
-                self._edge_point, self._edge_direction, self._edge_offset, self._edge_weight, self._edge_owner,
+        edge_pairs = 0
+        if step.silhouettes != "never":
+            kernels.draw(pixels, hits.distances, rows, self._images)
+            edge_pairs = kernels.edge_correspondences(
+                pixels, rows, batch.depth, self._images, batch.camera, strides, step.edge_reach, config.edge_step,
+                config.focal_baseline, self._edges, batch.edges,
             )  # fmt: skip
-        self._edge_point, self._edge_direction = self._edge_point[:count], self._edge_direction[:count]
-        self._edge_offset, self._edge_weight = self._edge_offset[:count], self._edge_weight[:count]
-        self._edge_owner = self._edge_owner[:count]
-        registration._instance_image.reshape(-1)[pixels] = kernels.UNKNOWN_PIXEL
+            kernels.erase(pixels, self._images)
+        batch.solve(self._points, pairs, self._edges, edge_pairs, strides, step, config, iterations)
+        if iterations:
+            moved = np.flatnonzero(batch.active)
+            self._scene.set_poses([batch.instances[k] for k in moved], batch.poses[moved])
 
-    def solve(self, iterations: int) -> None:
-        """Move every instance by solver steps on the fixed correspondences (0: only judge the present poses)."""
-        config = self._config
+
+class _Batch:
+    """The instances of one registration: poses, windows, and how they fared, one row each."""
+
+    def __init__(
+        self,
+        depth: Float32,
+        intrinsics: CameraIntrinsics,
+        models: Mapping[int, TrackedModel],
+        poses: Mapping[int, Float64],
+        max_rays: int,
+    ) -> None:
+        self.depth, self.intrinsics = np.ascontiguousarray(depth), intrinsics
+        self.camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
+        self._take(models, poses, list(poses))
+        inside = self.windows[:, 2] > self.windows[:, 0]
+        if not inside.all():
+            self._take(models, poses, [i for i, shown in zip(poses, inside, strict=True) if shown])
+        area = (self.windows[:, 2] - self.windows[:, 0]) * (self.windows[:, 3] - self.windows[:, 1])
+        self.strides = np.where(area <= max_rays, 1, np.where(area <= 4 * max_rays, 2, 4))
+        """(K,), pixel grids; chosen once for a registration, so that iterations do not alternate."""
+        count = len(self.instances)
+        self.active, self.moved = np.ones(count, bool), np.zeros(count)
+        """(K,), takes part in the present iteration; (K,), metres of surface moved by its last one."""
+        self.counts, self.edges = np.zeros((count, kernels.FIELDS), np.int64), np.zeros(count, np.int64)
+        self.used = self.strides.copy()
+        self.covariance, self.constrained = np.zeros((count, 6, 6)), np.zeros(count, np.int64)
+        self.stats = np.zeros((count, 3))
+
+    def _take(self, models: Mapping[int, TrackedModel], poses: Mapping[int, Float64], instances: list[int]) -> None:
+        self.instances = instances
+        self.poses = np.array([poses[i] for i in instances]).reshape(-1, 4, 4)
+        self._corners = np.array([models[i].corners for i in instances]).reshape(-1, 8, 3)
+        self._radii = np.array([models[i].radius for i in instances])
+        self.windows = np.zeros((len(instances), 4), np.int64)
+        self.locate()
+
+    def locate(self) -> None:
+        """Find the pixel windows of the present poses."""
+        size = (self.intrinsics.width, self.intrinsics.height)
+        kernels.image_windows(self._corners, self.poses, self.camera, size, 4, self.windows)
+
+    def solve(
+        self,
+        points: kernels.Points,
+        pairs: int,
+        edges: kernels.Edges,
+        edge_pairs: int,
+        strides: npt.NDArray[np.int64],
+        step: Step,
+        config: RegistrationConfig,
+        iterations: int,
+    ) -> None:
+        """Move the active instances by solver steps on fixed correspondences (0: only judge the present poses)."""
+        count = len(self.instances)
+        centres, shifts = self.poses[:, :3, 3].copy(), np.zeros((count, 3))
+        rotations = np.tile(np.eye(3), (count, 1, 1))
+        self.used[self.active] = strides[self.active]
+        steps = iterations
         if config.solver == "umeyama":
-            solver.umeyama(
-                self._measured, self._model, self._normal, self._owner, self._centres, self._rotations, self._shifts,
-                iterations,
-            )  # fmt: skip
-            iterations = 0
-        stride = self._strides.astype(float)
-        points, edges = config.correlation_area / stride**2, config.edge_correlation / stride
-        solver.gauss_newton(
-            self._measured, self._model, self._normal, self._weight, self._owner,
-            self._edge_point, self._edge_direction, self._edge_offset, self._edge_weight, self._edge_owner,
-            self._camera, self._centres, self._rotations, self._shifts, self._radii,
-            np.maximum(1.0, np.stack([points, edges], axis=1)), self._step.kernel, config.edge_kernel,
-            _EDGES[self._step.silhouettes], config.edge_sigma, config.unconstrained_sigma, config.max_shift,
-            config.max_turn, iterations, self._covariance, self._constrained, self._stats,
+            solver.umeyama(points, pairs, centres, rotations, shifts, iterations)
+            steps = 0
+        shares = np.array([[config.correlation_area / s**2, config.edge_correlation / s] for s in strides])
+        settings = solver.SolverSettings(
+            step.kernel, config.edge_kernel, _EDGES[step.silhouettes], config.edge_sigma, config.unconstrained_sigma,
+            config.max_shift, config.max_turn,
         )  # fmt: skip
+        solver.gauss_newton(
+            points, pairs, edges, edge_pairs, self.camera, centres, rotations, shifts, self._radii,
+            np.maximum(1.0, shares), self.active, settings, steps, self.covariance, self.constrained, self.stats,
+        )  # fmt: skip
+        if iterations:
+            solver.advance(self.poses, rotations, shifts, self._radii, self.active, self.moved)
 
-    def poses(self) -> dict[int, Float64]:
-        """T_camera_object (4, 4) of every instance after the steps so far."""
-        out: dict[int, Float64] = {}
-        for k, instance in enumerate(self._instances):
-            T = np.eye(4)
-            T[:3, :3] = orthonormal(self._rotations[k] @ self._poses[instance][:3, :3])
-            T[:3, 3] = self._centres[k] + self._shifts[k]
-            out[instance] = T
-        return out
-
-    def largest_step(self) -> float:
-        """How far this iteration moved an instance at most, metres of surface."""
-        moved = np.linalg.norm(self._shifts, axis=1)
-        turned = np.sqrt(np.maximum(3.0 - np.trace(self._rotations, axis1=1, axis2=2), 0.0))
-        return float(np.max(moved + turned * self._radii))
-
-    def results(self) -> dict[int, RegistrationResult]:
+    def results(self, config: RegistrationConfig) -> dict[int, RegistrationResult]:
         """Results of every instance at its present pose."""
-        config = self._config
+        systematic = np.repeat([config.systematic_translation**2, config.systematic_rotation**2], 3)
         out: dict[int, RegistrationResult] = {}
-        for k, (instance, T) in enumerate(self.poses().items()):
-            covariance = self._covariance[k].copy()
-            covariance[:3, :3] += config.systematic_translation**2 * np.eye(3)
-            covariance[3:, 3:] += config.systematic_rotation**2 * np.eye(3)
-            supported, occluded, missing, invalid = (int(n) for n in self._counts[k, kernels.SUPPORTED :])
-            inliers = max(float(self._stats[k, 0]), 1e-9)
+        for k, instance in enumerate(self.instances):
+            supported, occluded, missing, invalid = (int(n) for n in self.counts[k, kernels.SUPPORTED :])
+            inliers = max(float(self.stats[k, 0]), 1e-9)
             out[instance] = RegistrationResult(
-                T, covariance, int(self._constrained[k]), supported + occluded + missing + invalid, supported,
-                occluded, missing, invalid, int(self._strides[k]), float(np.sqrt(self._stats[k, 2] / inliers)),
-                float(self._stats[k, 1]) / inliers,
-                int(np.count_nonzero(self._edge_owner == k)),
-            )  # fmt: skip
+                T_camera_object=self.poses[k].copy(),
+                covariance=self.covariance[k] + np.diag(systematic),
+                constrained=int(self.constrained[k]),
+                rays=supported + occluded + missing + invalid,
+                supported=supported,
+                occluded=occluded,
+                missing=missing,
+                invalid=invalid,
+                stride=int(self.used[k]),
+                residual=float(np.sqrt(self.stats[k, 2] / inliers)),
+                misfit=float(self.stats[k, 1]) / inliers,
+                edges=int(self.edges[k]),
+            )
         return out
 
 

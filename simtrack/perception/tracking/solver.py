@@ -4,6 +4,8 @@ Compiled, all instances in one call; see `simtrack.perception.tracking.correspon
 scaled by the model's radius, so that all six directions are in metres of surface.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
@@ -17,9 +19,60 @@ EDGES_NEVER, EDGES_WHERE_OPEN, EDGES_ALWAYS = 0, 1, 2
 """When silhouettes take part."""
 
 
+class SolverSettings(NamedTuple):
+    """What `gauss_newton` needs to know."""
+
+    kernel: float
+    """Scale of the robust kernel on the faces' residuals, standard deviations."""
+    edge_kernel: float
+    """... and on the silhouettes'."""
+    edges: int
+    """When silhouettes take part."""
+    edge_sigma: float
+    """See `combine`, metres of surface."""
+    unconstrained_sigma: float
+    """See `constrained_solution`, metres of surface."""
+    max_shift: float
+    """Longest step, metres."""
+    max_turn: float
+    """Largest step, radians."""
+
+
 @njit(cache=True, nogil=True)
 def _symmetric(upper):
     return upper + np.triu(upper, 1).T
+
+
+@njit(cache=True, nogil=True)
+def cholesky(A, shift, L):
+    """Lower factor `L` (6, 6) of ``A - shift I``; returns whether that is positive definite."""
+    for i in range(6):
+        for j in range(i + 1):
+            total = A[i, j]
+            if i == j:
+                total -= shift
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i > j:
+                L[i, j] = total / L[j, j]
+            elif total > 1e-12 * A[i, i]:
+                L[i, i] = np.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _substitute(L, b):
+    """Solve ``L L^T x = b`` in place."""
+    for i in range(6):
+        for k in range(i):
+            b[i] -= L[i, k] * b[k]
+        b[i] /= L[i, i]
+    for i in range(5, -1, -1):
+        for k in range(i + 1, 6):
+            b[i] -= L[k, i] * b[k]
+        b[i] /= L[i, i]
 
 
 @njit(cache=True, nogil=True)
@@ -31,6 +84,9 @@ def combine(H, g, H_edge, g_edge, edges, edge_sigma):
     """
     if edges == EDGES_ALWAYS:
         return H + H_edge, g + g_edge
+    # Silhouettes would have a say of less than 1/600 in every direction.
+    if edges == EDGES_NEVER or cholesky(H, 5.0 / edge_sigma**2, np.empty((6, 6))):
+        return H, g
     values, vectors = np.linalg.eigh(H)
     voice = np.empty(6)
     for i in range(6):
@@ -46,6 +102,14 @@ def constrained_solution(H, b, unconstrained_sigma):
     Returns the step (6,), the covariance (6, 6), which is (1 m)^2 in directions known less well than
     `unconstrained_sigma`, and the number of constrained directions.
     """
+    L = np.empty((6, 6))
+    if cholesky(H, 1.0 / unconstrained_sigma**2, L):  # all of them: no need to look at each
+        cholesky(H, 0.0, L)
+        step, P = b.copy(), np.eye(6)
+        _substitute(L, step)
+        for i in range(6):
+            _substitute(L, P[i])
+        return step, P, 6
     values, vectors = np.linalg.eigh(H)
     step, variance = np.zeros(6), np.ones(6)
     constrained = 0
@@ -73,66 +137,62 @@ def rotation(phi):
 
 @njit(cache=True, nogil=True)
 def gauss_newton(
-    measured, model, normal, weight, owner,
-    edge_point, edge_direction, edge_offset, edge_weight, edge_owner,
-    camera, centres, rotations, shifts, radii, correlation, kernel, edge_kernel, edges, edge_sigma,
-    unconstrained_sigma, max_shift, max_turn, iterations, covariance, constrained, stats,
+    points, pairs, edges, edge_pairs, camera, centres, rotations, shifts, radii, correlation, active, settings,
+    iterations, covariance, constrained, stats,
 ):  # fmt: skip
-    """Move every instance by `iterations` steps (0: only judge), then leave what is known at the last pose.
+    """Move every active instance by `iterations` steps (0: only judge), then leave what is known at the last pose.
 
-    The first five arrays come from `point_correspondences`, the next five from `edge_correspondences`; `camera` (4,) is
-    fx, fy, cx, cy; `centres` (K, 3) are the objects' origins at the time of the cast. In and out: `rotations` (K, 3, 3)
-    and `shifts` (K, 3), the motion since the cast about the centres. `radii` (K,), metres; `correlation` (K, 2):
-    readings, and silhouette pixels, that count as one; `kernel`, `edge_kernel`: scales of the robust kernels in
-    standard deviations; `edges`: when silhouettes take part; `edge_sigma`, `unconstrained_sigma`: see `combine` and
-    `constrained_solution`; `max_shift`, `max_turn`: limits of a step, metres and radians. Out: `covariance` (K, 6, 6),
-    `constrained` (K,) number of constrained directions, `stats` (K, 3) of `point_normal_equations`.
+    The first `pairs` of `points` and `edge_pairs` of `edges` count; `camera` (4,) is fx, fy, cx, cy; `centres` (K, 3)
+    are the objects' origins at the time of the cast. In and out: `rotations` (K, 3, 3) and `shifts` (K, 3), the motion
+    since the cast about the centres. `radii` (K,), metres; `correlation` (K, 2): readings, and silhouette pixels, that
+    count as one; `active` (K,). Out, of active instances: `covariance` (K, 6, 6), `constrained` (K,) number of
+    constrained directions, `stats` (K, 3) of `point_normal_equations`.
     """
     K = centres.shape[0]
-    kernels = np.full(K, kernel)
+    H, H_edge = np.empty((K, 6, 6)), np.empty((K, 6, 6))
+    g, g_edge = np.empty((K, 6)), np.empty((K, 6))
+    sums = np.empty((K, 3))
+    scale = np.ones(6)
     for step in range(iterations + 1):
-        H, H_edge = np.zeros((K, 6, 6)), np.zeros((K, 6, 6))
-        g, g_edge = np.zeros((K, 6)), np.zeros((K, 6))
-        edge_stats = np.zeros((K, 2))
-        stats[:] = 0.0
-        point_normal_equations(measured, model, normal, weight, owner, centres, rotations, shifts, kernels, H, g, stats)
-        if edges != EDGES_NEVER:
+        H[:], H_edge[:], g[:], g_edge[:], sums[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+        point_normal_equations(points, pairs, centres, rotations, shifts, settings.kernel, H, g, sums)
+        if settings.edges != EDGES_NEVER:
             edge_normal_equations(
-                edge_point, edge_direction, edge_offset, edge_weight, edge_owner, camera, centres, rotations, shifts,
-                edge_kernel, H_edge, g_edge, edge_stats,
-            )  # fmt: skip
+                edges, edge_pairs, camera, centres, rotations, shifts, settings.edge_kernel, H_edge, g_edge
+            )
         for k in range(K):
-            scale = np.ones(6)
+            if not active[k]:
+                continue
             scale[3:] = 1.0 / radii[k]
             outer = scale.reshape(6, 1) * scale
             # A posteriori variance factor: how much better or worse the faces fit than the sensor model says.
-            factor = min(max(stats[k, 1] / stats[k, 0], 1e-3), 4.0) if stats[k, 0] > 10.0 else 1.0
+            factor = min(max(sums[k, 1] / sums[k, 0], 1e-3), 4.0) if sums[k, 0] > 10.0 else 1.0
             share, edge_share = 1.0 / (correlation[k, 0] * factor), 1.0 / correlation[k, 1]
             A, b = combine(
-                _symmetric(H[k]) * outer * share, g[k] * scale * share,
-                _symmetric(H_edge[k]) * outer * edge_share, g_edge[k] * scale * edge_share, edges, edge_sigma,
+                _symmetric(H[k]) * outer * share, g[k] * scale * share, _symmetric(H_edge[k]) * outer * edge_share,
+                g_edge[k] * scale * edge_share, settings.edges, settings.edge_sigma,
             )  # fmt: skip
-            xi, P, known = constrained_solution(A, b, unconstrained_sigma)
+            xi, P, known = constrained_solution(A, b, settings.unconstrained_sigma)
             if step == iterations:
-                covariance[k], constrained[k] = P * outer, known
+                covariance[k], constrained[k], stats[k] = P * outer, known, sums[k]
                 continue
             xi *= scale
             length = np.sqrt(xi[0] ** 2 + xi[1] ** 2 + xi[2] ** 2)
             angle = np.sqrt(xi[3] ** 2 + xi[4] ** 2 + xi[5] ** 2)
-            xi[:3] *= min(1.0, max_shift / max(length, 1e-12))
-            xi[3:] *= min(1.0, max_turn / max(angle, 1e-12))
+            xi[:3] *= min(1.0, settings.max_shift / max(length, 1e-12))
+            xi[3:] *= min(1.0, settings.max_turn / max(angle, 1e-12))
             rotations[k] = rotation(xi[3:]) @ rotations[k]
             shifts[k] += xi[:3]
 
 
 @njit(cache=True, nogil=True)
-def umeyama(measured, model, normal, owner, centres, rotations, shifts, iterations):
+def umeyama(points, pairs, centres, rotations, shifts, iterations):
     """Move every instance by `iterations` closed-form rigid fits (Umeyama 1991, eqs. 40-42, without scale)."""
     K = centres.shape[0]
     for _ in range(iterations):
         count, cross = np.zeros(K), np.zeros((K, 3, 3))
         mean_p, mean_q = np.zeros((K, 3)), np.zeros((K, 3))
-        umeyama_sums(measured, model, normal, owner, centres, rotations, shifts, count, mean_p, mean_q, cross)
+        umeyama_sums(points, pairs, centres, rotations, shifts, count, mean_p, mean_q, cross)
         for k in range(K):
             if count[k] < 6:
                 continue
@@ -143,3 +203,18 @@ def umeyama(measured, model, normal, owner, centres, rotations, shifts, iteratio
             R = (U * signs) @ Vt
             rotations[k] = R @ rotations[k]
             shifts[k] = R @ shifts[k] + p - R @ q
+
+
+@njit(cache=True, nogil=True)
+def advance(poses, rotations, shifts, radii, active, moved):
+    """Apply motions to the active of the poses (K, 4, 4), in place; `moved` (K,): how far, metres of surface."""
+    for k in range(poses.shape[0]):
+        moved[k] = 0.0
+        if not active[k]:
+            continue
+        R = rotations[k] @ np.ascontiguousarray(poses[k, :3, :3])
+        # A Newton step of the polar decomposition keeps the product orthonormal.
+        poses[k, :3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
+        poses[k, :3, 3] += shifts[k]
+        turned = np.sqrt(max(3.0 - (rotations[k, 0, 0] + rotations[k, 1, 1] + rotations[k, 2, 2]), 0.0))
+        moved[k] = np.sqrt(shifts[k, 0] ** 2 + shifts[k, 1] ** 2 + shifts[k, 2] ** 2) + turned * radii[k]

@@ -58,6 +58,8 @@ class TrackerConfig:
     """Nothing that hands carry moves faster than this, m/s; a registration that says so has slid off ..."""
     fastest_turn: float = 4.0
     """... or turns faster than this, rad/s."""
+    poor_misfit: float = 1.8
+    """A registration with a larger misfit than this is not believed."""
     doubt_after: int = 3
     """So many registrations in a row that cannot be believed end the belief in a track."""
     shared_surface: float = 0.4

@@ -158,7 +158,8 @@ class ObjectTracker:
             # It was moved while nobody looked, and its surface alone does not tell how: detections have to.
             self._demote(target, view.stamp)
         measurement = self._measurement(view, result, target.last_seen)
-        if target.known and self._incredible(target, measurement):
+        poor = result.misfit > self.config.poor_misfit
+        if target.known and (poor or self._incredible(target, measurement)):
             target.filter.skip(view.stamp)
             target.doubts += 1
             if target.doubts >= self.config.doubt_after and target.status is not TrackStatus.TENTATIVE:
@@ -175,7 +176,8 @@ class ObjectTracker:
         # A fit that leaves no doubt needs no second detection to be believed.
         clear = not self._doubtful(target) and not self._vague(target)
         told = target.detections >= (1 if clear else self.config.confirm_detections)
-        enough = told and target.frames >= self.config.confirm_frames
+        fits = result.misfit <= self.config.fit.misfit
+        enough = told and fits and target.frames >= self.config.confirm_frames
         if enough or target.status is not TrackStatus.TENTATIVE:
             target.status, target.known = TrackStatus.CONFIRMED, True
 

@@ -2,7 +2,12 @@ import numpy as np
 
 from simtrack.geometry.transforms import exp_so3, perturb
 from simtrack.perception.tracking import solver
-from simtrack.perception.tracking.correspondences import edge_normal_equations, point_normal_equations
+from simtrack.perception.tracking.correspondences import (
+    Edges,
+    Points,
+    edge_normal_equations,
+    point_normal_equations,
+)
 
 CAMERA = np.array([577.0, 577.0, 319.5, 239.5])
 
@@ -32,10 +37,8 @@ def test_point_gradient_is_that_of_the_cost() -> None:
     centre = np.array([0.01, -0.02, 1.0])
     H, g, stats = np.zeros((1, 6, 6)), np.zeros((1, 6)), np.zeros((1, 3))
     n = len(model)
-    point_normal_equations(
-        measured, model, normal, np.full(n, 1e4), np.zeros(n, np.int32), centre[None], np.eye(3)[None],
-        np.zeros((1, 3)), np.full(1, 1e6), H, g, stats,
-    )  # fmt: skip
+    points = Points(measured, model, normal, np.full(n, 1e4), np.zeros(n, np.int32))
+    point_normal_equations(points, n, centre[None], np.eye(3)[None], np.zeros((1, 3)), 1e6, H, g, stats)
     step = 1e-6
     for i in range(6):
         xi = np.zeros(6)
@@ -61,11 +64,9 @@ def test_silhouette_gradient_is_that_of_the_projection() -> None:
         shift = CAMERA[:2] * (moved[:, :2] / moved[:, 2:] - point[:, :2] / point[:, 2:])
         return 0.5 * float(np.sum((offset - np.einsum("ij,ij->i", direction, shift)) ** 2))
 
-    H, g, stats = np.zeros((1, 6, 6)), np.zeros((1, 6)), np.zeros((1, 2))
-    edge_normal_equations(
-        point, direction, offset, np.ones(count), np.zeros(count, np.int32), CAMERA, centre[None], np.eye(3)[None],
-        np.zeros((1, 3)), 1e6, H, g, stats,
-    )  # fmt: skip
+    H, g = np.zeros((1, 6, 6)), np.zeros((1, 6))
+    edges = Edges(point, direction, offset, np.ones(count), np.zeros(count, np.int32))
+    edge_normal_equations(edges, count, CAMERA, centre[None], np.eye(3)[None], np.zeros((1, 3)), 1e6, H, g)
     for i in range(6):
         xi = np.zeros(6)
         xi[i] = 1e-6
@@ -96,7 +97,35 @@ def test_umeyama_recovers_a_rigid_motion() -> None:
     xi = np.array([0.004, -0.003, 0.002, 0.02, -0.01, 0.015])
     measured = centre + (model - centre) @ exp_so3(xi[3:]).T + xi[:3]
     rotations, shifts = np.eye(3)[None].copy(), np.zeros((1, 3))
-    solver.umeyama(measured, model, normal, np.zeros(400, np.int32), centre[None], rotations, shifts, 60)
+    points = Points(measured, model, normal, np.ones(400), np.zeros(400, np.int32))
+    solver.umeyama(points, 400, centre[None], rotations, shifts, 60)
     T = perturb(np.eye(4), xi)
     np.testing.assert_allclose(rotations[0], T[:3, :3], atol=1e-4)
     np.testing.assert_allclose(shifts[0], xi[:3], atol=1e-4)
+
+
+def test_the_short_way_through_a_well_known_system_is_the_long_one() -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        root = rng.standard_normal((6, 6))
+        H, b = 1e5 * (root @ root.T + 6.0 * np.eye(6)), rng.standard_normal(6)
+        step, covariance, constrained = solver.constrained_solution(H, b, 0.01)
+        assert constrained == 6
+        np.testing.assert_allclose(step, np.linalg.solve(H, b), rtol=1e-9)
+        np.testing.assert_allclose(covariance, np.linalg.inv(H), rtol=1e-8)
+        L = np.zeros((6, 6))
+        least = float(np.linalg.eigvalsh(H)[0])
+        assert solver.cholesky(H, 0.999 * least, L) and not solver.cholesky(H, 1.001 * least, L)
+
+
+def test_poses_stay_rigid_over_many_motions() -> None:
+    rng = np.random.default_rng(7)
+    poses, moved = np.eye(4)[None].copy(), np.zeros(1)
+    expected = np.eye(3)
+    for _ in range(500):
+        phi = 0.02 * rng.standard_normal(3)
+        solver.advance(poses, exp_so3(phi)[None], np.zeros((1, 3)), np.ones(1), np.ones(1, bool), moved)
+        expected = exp_so3(phi) @ expected
+        assert abs(moved[0] - np.linalg.norm(phi)) < 1e-4
+    np.testing.assert_allclose(poses[0, :3, :3] @ poses[0, :3, :3].T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(poses[0, :3, :3], expected, atol=1e-11)
