@@ -3,12 +3,13 @@
 Pairs of room rows share a corridor, which is cut into pieces as wide as a room. Every room has a door to its piece of
 corridor; some have one to the room beside or behind them. Doors are open or closed. Rooms come first in the numbering
 of regions, row by row, then the pieces of corridor; object ``10 r + k`` is the k-th of room r, and after the objects
-comes the structure of every region, one object each.
+comes the structure of every region, one object each. The hundred rooms in the middle are the same in worlds of every
+size, so that one can drive and see the same in a small world and in a large one.
 """
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 from functools import cache
 
 import numpy as np
@@ -28,6 +29,8 @@ _CONNECTED = 0.3
 """Share of neighbouring rooms with a door between them."""
 _PITCH = 2 * DEPTH + CORRIDOR
 """From one corridor to the next, metres."""
+_MIDDLE = 10
+"""Rows and columns of the middle that worlds of one seed share."""
 _CHUNK = 1 << 16
 """Rooms that are furnished at a time, which bounds the memory that building takes."""
 
@@ -40,6 +43,8 @@ class Rooms:
     """Rooms."""
     columns: int
     """Rooms in a row."""
+    middle: int
+    """The piece of corridor in the middle, where drives start: a region."""
     index: ObjectIndex
     """Objects and structure; ``index.regions`` are the rooms and the pieces of corridor."""
     meshes: tuple[TriangleMesh, ...]
@@ -67,23 +72,24 @@ def build(count: int, objects: Sequence[TriangleMesh], seed: int = 0) -> Rooms:
     if not objects:
         raise InvalidValueError("objects", 0, "at least one mesh")
     rows = max(n for n in range(2, int(np.sqrt(count)) + 2, 2) if count % n == 0)
-    plan = _Plan.drawn(rows, count // rows, np.random.default_rng([seed, 0]))
+    plan = _Plan.drawn(rows, count // rows, seed)
     regions = plan.regions()
     meshes = (*objects, *(mesh for _, mesh in _structures()))
     bounds = np.array([[mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)] for mesh in meshes])
     first, total = count * OBJECTS_PER_ROOM, count * OBJECTS_PER_ROOM + len(regions)
     kinds, region_of = np.empty(total, np.uint16), np.empty(total, np.int32)
     positions, quaternions = np.zeros((total, 3), np.float32), np.zeros((total, 4), np.float32)
-    for number, start in enumerate(range(0, count, _CHUNK)):
-        rooms = np.arange(start, min(start + _CHUNK, count), dtype=np.int32)
-        rows_of = slice(start * OBJECTS_PER_ROOM, (start + len(rooms)) * OBJECTS_PER_ROOM)
-        contents = kinds[rows_of], positions[rows_of], quaternions[rows_of]
-        _furnish(plan.layouts[rooms], bounds[: len(objects)], *contents, np.random.default_rng([seed, 1, number]))
+    parts = [(rooms, [seed, 4, number]) for number, rooms in enumerate(_chunks(count))]
+    for rooms, entropy in (*parts, (plan.middle_rooms, [seed, 5])):
+        rows_of = (OBJECTS_PER_ROOM * rooms[:, None] + np.arange(OBJECTS_PER_ROOM)).ravel()
+        contents = _furnished(plan.layouts.ravel()[rooms], bounds[: len(objects)], np.random.default_rng(entropy))
+        kinds[rows_of], positions[rows_of], quaternions[rows_of] = contents
         region_of[rows_of] = np.repeat(rooms, OBJECTS_PER_ROOM)
     kinds[first:] = len(objects) + plan.structure()
     region_of[first:] = np.arange(len(regions))
     quaternions[first:, 0] = 1.0
-    return Rooms(count, plan.columns, ObjectIndex(regions, bounds, kinds, region_of, positions, quaternions), meshes)
+    index = ObjectIndex(regions, bounds, kinds, region_of, positions, quaternions)
+    return Rooms(count, plan.columns, plan.middle_piece, index, meshes)
 
 
 def drive(world: Rooms, frames: int, step: float = 0.1) -> Float64:
@@ -114,36 +120,76 @@ def drive(world: Rooms, frames: int, step: float = 0.1) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    rows: int
-    columns: int
+    """How rooms are furnished and which doors there are; ``opened`` counts only where there is a door."""
+
     layouts: npt.NDArray[np.uint8]
-    """(rooms,) how each is furnished."""
+    """(rows, columns)."""
     beside: Bool
     """(rows, columns - 1), door to the room on the east."""
     behind: Bool
     """(rows / 2 - 1, columns), door between the second row of a pair and the first of the next."""
-    opened: tuple[Bool, Bool, Bool]
-    """Of the doors to the corridor (rows, columns), and of those beside and behind, where there is one."""
+    opened_to_corridor: Bool
+    """(rows, columns)."""
+    opened_beside: Bool
+    opened_behind: Bool
 
     @staticmethod
-    def drawn(rows: int, columns: int, rng: np.random.Generator) -> "_Plan":
-        beside, behind = (rows, columns - 1), (rows // 2 - 1, columns)
-        return _Plan(
-            rows,
-            columns,
-            rng.integers(LAYOUTS, size=rows * columns, dtype=np.uint8),
-            rng.random(beside, np.float32) < _CONNECTED,
-            rng.random(behind, np.float32) < _CONNECTED,
-            (
-                rng.random((rows, columns), np.float32) < _OPEN_TO_CORRIDOR,
-                rng.random(beside, np.float32) < _OPEN_BETWEEN,
-                rng.random(behind, np.float32) < _OPEN_BETWEEN,
-            ),
+    def drawn(rows: int, columns: int, seed: int) -> "_Plan":
+        """A plan whose middle, if it is as large, is the one that all plans of a seed share."""
+        plan = _Plan._random(rows, columns, np.random.default_rng([seed, 2]))
+        if min(rows, columns) >= _MIDDLE:
+            shared = _Plan._random(_MIDDLE, _MIDDLE, np.random.default_rng([seed, 3]))
+            row, column = plan._middle_corner
+            for field in fields(_Plan):
+                part = getattr(shared, field.name)
+                first = row // 2 if field.name.endswith("behind") else row
+                getattr(plan, field.name)[first:, column:][: part.shape[0], : part.shape[1]] = part
+        return plan
+
+    @staticmethod
+    def _random(rows: int, columns: int, rng: np.random.Generator) -> "_Plan":
+        rooms, beside, behind = (rows, columns), (rows, columns - 1), (rows // 2 - 1, columns)
+        layouts = rng.integers(LAYOUTS, size=rooms, dtype=np.uint8)
+        shares = (
+            (beside, _CONNECTED),
+            (behind, _CONNECTED),
+            (rooms, _OPEN_TO_CORRIDOR),
+            (beside, _OPEN_BETWEEN),
+            (behind, _OPEN_BETWEEN),
         )
+        return _Plan(layouts, *(rng.random(shape, np.float32) < share for shape, share in shares))
+
+    @property
+    def columns(self) -> int:
+        """Rooms in a row."""
+        return self.layouts.shape[1]
+
+    @property
+    def _middle_corner(self) -> tuple[int, int]:
+        """First row, which starts a pair, and first column of the middle."""
+        rows, columns = self.layouts.shape
+        return 2 * ((rows // 2 - _MIDDLE // 2 + 1) // 2), columns // 2 - _MIDDLE // 2
+
+    @property
+    def middle_rooms(self) -> Int32:
+        """(100,) rooms of the middle, row by row; none if the world is smaller."""
+        if min(self.layouts.shape) < _MIDDLE:
+            return np.empty(0, np.int32)
+        (row, column), size = self._middle_corner, np.arange(_MIDDLE, dtype=np.int32)
+        return ((row + size)[:, None] * self.columns + column + size).ravel()
+
+    @property
+    def middle_piece(self) -> int:
+        """The piece of corridor, as a region, in the middle."""
+        pair, column = len(self.layouts) // 4, self.columns // 2
+        if len(self.middle_rooms):
+            row, first = self._middle_corner
+            pair, column = row // 2 + _MIDDLE // 4, first + _MIDDLE // 2
+        return self.layouts.size + pair * self.columns + column
 
     def regions(self) -> Regions:
         """Rooms and pieces of corridor with the doors and joints between them."""
-        rows, columns = self.rows, self.columns
+        rows, columns = self.layouts.shape
         x, pairs = WIDTH * np.arange(columns), _PITCH * np.arange(rows // 2)
         y = np.stack([pairs, pairs + DEPTH + CORRIDOR], axis=1).ravel()
         corner = np.concatenate([_grid(x, y, 0.0), _grid(x, pairs + DEPTH, 0.0)])
@@ -155,7 +201,6 @@ class _Plan:
         thresholds = np.stack([pairs + DEPTH, pairs + DEPTH + CORRIDOR], axis=1).ravel()
         in_row, in_column = (0.5 * DOOR_WIDTH, 0.0, 0.0), (0.0, 0.5 * DOOR_WIDTH, 0.0)
         upright, lintel, joint = (0.0, 0.0, 0.5 * DOOR_HEIGHT), 0.5 * DOOR_HEIGHT, (0.0, 0.5 * CORRIDOR, 0.0)
-        to_corridor, beside, behind = self.opened
         groups = [
             _portals(room, np.repeat(piece, 2, axis=0), _grid(x + 0.5 * WIDTH, thresholds, lintel), (in_row, upright)),
             _portals(room[:, :-1], room[:, 1:], _grid(x[1:], y + 0.5 * DEPTH, lintel), (in_column, upright)),
@@ -169,27 +214,28 @@ class _Plan:
         ]
         joints = np.ones(len(groups[-1][0]), bool)
         exists = np.concatenate([np.ones(room.size, bool), self.beside.ravel(), self.behind.ravel(), joints])
-        opened = np.concatenate([to_corridor.ravel(), beside.ravel(), behind.ravel(), joints])
+        doors = self.opened_to_corridor, self.opened_beside, self.opened_behind
+        opened = np.concatenate([*(door.ravel() for door in doors), joints])
         sides, centres, axes = (np.concatenate(column)[exists] for column in zip(*groups, strict=True))
         return Regions(corner, corner + size, sides, centres, axes, opened[exists])
 
     def structure(self) -> npt.NDArray[np.uint16]:
         """(R,) the structure of every region, a row of `_structures`."""
-        doors = np.zeros((self.rows, self.columns), np.uint8)
+        doors = np.zeros(self.layouts.shape, np.uint8)
         doors[0::2] |= models.NORTH
         doors[1::2] |= models.SOUTH
         doors[:, :-1] |= np.where(self.beside, models.EAST, 0).astype(np.uint8)
         doors[:, 1:] |= np.where(self.beside, models.WEST, 0).astype(np.uint8)
         doors[1:-1:2] |= np.where(self.behind, models.NORTH, 0).astype(np.uint8)
         doors[2::2] |= np.where(self.behind, models.SOUTH, 0).astype(np.uint8)
-        ends = np.zeros((self.rows // 2, self.columns), np.uint8)
+        ends = np.zeros((len(doors) // 2, self.columns), np.uint8)
         ends[:, 0] |= models.WEST
         ends[:, -1] |= models.EAST
         keys = [key for key, _ in _structures()]
         table = np.zeros((2, 16, LAYOUTS), np.uint16)
         for number, key in enumerate(keys):
             table[key] = number
-        return np.concatenate([table[0, doors.ravel(), self.layouts], table[1, ends.ravel(), 0]])
+        return np.concatenate([table[0, doors.ravel(), self.layouts.ravel()], table[1, ends.ravel(), 0]])
 
 
 def _grid(x: npt.NDArray[np.floating], y: npt.NDArray[np.floating], z: float) -> Float64:
@@ -221,25 +267,28 @@ def _structures() -> tuple[tuple[tuple[int, int, int], TriangleMesh], ...]:
     return tuple((key, TriangleMesh(mesh.vertices, mesh.faces)) for key, mesh in (*rooms, *pieces))
 
 
-def _furnish(
-    layouts: npt.NDArray[np.uint8],
-    bounds: Float64,
-    kinds: npt.NDArray[np.uint16],
-    positions: Float32,
-    quaternions: Float32,
-    rng: np.random.Generator,
-) -> None:
-    """Put objects on different spots of the furniture: write their kinds, positions in the room and quaternions."""
+def _chunks(count: int) -> Iterator[Int32]:
+    """All rooms, a chunk at a time."""
+    for start in range(0, count, _CHUNK):
+        yield np.arange(start, min(start + _CHUNK, count), dtype=np.int32)
+
+
+def _furnished(
+    layouts: npt.NDArray[np.uint8], bounds: Float64, rng: np.random.Generator
+) -> tuple[npt.NDArray[np.uint16], Float32, Float32]:
+    """Objects on different spots of the furniture: kinds (K,), positions (K, 3) in the room, quaternions (K, 4)."""
     places = [models.spots(layout) for layout in range(LAYOUTS)]
     spots = np.stack([place[: min(map(len, places))] for place in places]).astype(np.float32)
     draws = rng.random((len(layouts), spots.shape[1]), np.float32)
     chosen = np.argpartition(draws, OBJECTS_PER_ROOM - 1, axis=1)[:, :OBJECTS_PER_ROOM]
-    kinds[:] = rng.integers(len(bounds), size=len(kinds), dtype=np.uint16)
-    positions[:] = spots[layouts[:, None], chosen].reshape(-1, 3)
-    positions[:, :2] += rng.uniform(-0.01, 0.01, (len(positions), 2)).astype(np.float32)
+    kinds = rng.integers(len(bounds), size=chosen.size, dtype=np.uint16)
+    positions = spots[layouts[:, None], chosen].reshape(-1, 3)
+    positions[:, :2] += rng.uniform(-0.01, 0.01, (len(positions), 2))
     positions[:, 2] += (1e-3 - bounds[:, 0, 2]).astype(np.float32)[kinds]
-    half = (np.pi * rng.random(len(kinds), np.float32)).astype(np.float32)
+    half = np.pi * rng.random(len(kinds), np.float32)
+    quaternions = np.zeros((len(kinds), 4), np.float32)
     quaternions[:, 0], quaternions[:, 3] = np.cos(half), np.sin(half)
+    return kinds, positions, quaternions
 
 
 # ------------------------------------------------------------------------------------------------------------- driving
@@ -249,8 +298,7 @@ def _tour(world: Rooms, length: float) -> Float64:
     """(K, 2) way from the middle of a corridor through one room after the other, at least `length` metres long."""
     regions = world.index.regions
     middle = 0.5 * (regions.low + regions.high)[:, :2]
-    corridor = middle[world.count :]
-    here = world.count + int(np.argmin(np.linalg.norm(corridor - middle.mean(axis=0), axis=1)))
+    here = world.middle
     way, travelled, visited = [middle[here]], 0.0, {here}
     while travelled < length:
         path = _path_to_new_room(world, here, visited)

@@ -1,6 +1,6 @@
 """A world of any size to cast rays at: what rays can reach is live in Embree, the rest rests in the index."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -145,7 +145,7 @@ class PagedScene:
         if not self._scene.fallback:
             for mesh in (*self.meshes, self._panel):
                 _ = mesh.scene_handle  # hierarchies are built now, not when a room comes into reach
-        self._place(index.members(EVERYWHERE))
+        self._place(index.members(EVERYWHERE).tolist())
 
     # ------------------------------------------------------------------------------------------------ what is in it
 
@@ -165,7 +165,7 @@ class PagedScene:
         if region != EVERYWHERE and region not in self._live:
             self._retire([number])
         elif number in self._slots:
-            self._scene.set_pose(self._slots[number], self._local(self.index.pose(number)))
+            self._scene.set_pose(self._slots[number], self._poses([number])[0])
         else:
             self._place([number])
 
@@ -337,26 +337,28 @@ class PagedScene:
         self._shared = True
         return PagedHits(hits, self._owners)
 
-    def _local(self, T: Float64) -> Float64:
-        """Pose or poses (..., 4, 4) in the frame of the live scene."""
-        T[..., :3, 3] -= self._origin
-        return T
-
     def _keep_origin_near(self, position: Float64) -> None:
-        if np.abs(position - self._origin).max() <= _FAR:
-            return
-        self._origin = np.round(position / _ORIGIN_STEP) * _ORIGIN_STEP
-        for owner, slot in self._slots.items():
-            self._scene.set_pose(slot, self._pose(owner))
+        if np.abs(position - self._origin).max() > _FAR:
+            self._origin = np.round(position / _ORIGIN_STEP) * _ORIGIN_STEP
+            for slot, pose in zip(self._slots.values(), self._poses(list(self._slots)), strict=True):
+                self._scene.set_pose(slot, pose)
 
-    def _pose(self, owner: int) -> Float64:
-        return self._local(self.regions.rectangle(-2 - owner) if owner < 0 else self.index.pose(owner))
+    def _poses(self, owners: Sequence[int]) -> Float64:
+        """(K, 4, 4) of objects and panels in the frame of the live scene."""
+        numbers = np.array(owners, np.int64)
+        out = np.empty((len(numbers), 4, 4))
+        out[numbers >= 0] = self.index.poses(numbers[numbers >= 0])
+        for k in np.flatnonzero(numbers < 0):
+            out[k] = self.regions.rectangle(-2 - int(numbers[k]))
+        out[:, :3, 3] -= self._origin
+        return out
 
     def _load(self, region: int) -> int:
-        self._live[region] = self._clock
         portals = self.regions.portals_of(region)
-        panels = (-2 - portals[~self.regions.is_open[portals]]).tolist()
-        return self._place(self.index.members(region)) + self._place(panels)
+        panels = -2 - portals[~self.regions.is_open[portals]]
+        loaded = self._place([*self.index.members(region).tolist(), *panels.tolist()])
+        self._live[region] = self._clock
+        return loaded
 
     def _unload(self, region: int) -> int:
         del self._live[region]
@@ -365,23 +367,24 @@ class PagedScene:
         panels = [-2 - p for p in portals if int(sides[p, 0]) not in self._live and int(sides[p, 1]) not in self._live]
         return self._retire(self.index.members(region).tolist()) + self._retire(panels)
 
-    def _place(self, owners: npt.ArrayLike) -> int:
+    def _place(self, owners: Iterable[int]) -> int:
         """Add instances for objects, or for panels (-2 - portal); those that have one keep it. Returns how many."""
-        new = [owner for owner in np.asarray(owners, np.int64).tolist() if owner not in self._slots]
+        new = [int(owner) for owner in owners if owner not in self._slots]
+        if len(self._slots) + len(new) > MAX_INSTANCE:
+            raise RaycastError(f"more than {MAX_INSTANCE} instances within reach of the rays; cast less far")
         self._own_table(len(new))
-        for owner in new:
+        models = iter(self.index.models([owner for owner in new if owner >= 0]).tolist())
+        for owner, pose in zip(new, self._poses(new), strict=True):
             slot = self._free.pop() if self._free else len(self._slots)
-            if slot >= MAX_INSTANCE:
-                raise RaycastError(f"more than {MAX_INSTANCE} instances within reach; cast less far than now")
-            mesh = self._panel if owner < 0 else self.meshes[int(self.index.models(owner)[0])]
-            self._scene.add(mesh, self._pose(owner), instance=slot)
+            self._scene.add(self._panel if owner < 0 else self.meshes[next(models)], pose, instance=slot)
             self._slots[owner], self._owners[slot] = slot, owner
         return len(new)
 
     def _retire(self, owners: Sequence[int]) -> int:
         """Remove the instances of objects or panels that have one. Returns how many."""
         gone = [owner for owner in owners if owner in self._slots]
-        self._own_table(0)
+        if gone:
+            self._own_table(0)
         for owner in gone:
             slot = self._slots.pop(owner)
             self._scene.remove(slot)

@@ -47,7 +47,7 @@ def test_objects_are_moved_added_and_removed_without_getting_lost() -> None:
             assert index.move(number, T) == index.region(number)
             expected[number] = T
     lists = [index.members(region).tolist() for region in (EVERYWHERE, *range(len(regions)))]
-    assert sorted(sum(lists, [])) == sorted(expected)
+    assert sorted(n for members in lists for n in members) == sorted(expected)
     assert all(members == sorted(members) for members in lists)
     for number, T in expected.items():
         np.testing.assert_allclose(index.pose(number), T, atol=2e-6)
@@ -88,7 +88,7 @@ def test_arrays_are_taken_over() -> None:
         np.zeros(3, np.uint16),
         np.zeros(3, np.int32),
         np.ones((3, 3), np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (3, 1)),
+        np.tile(np.array([1, 0, 0, 0], np.float32), (3, 1)),
     )
     index = ObjectIndex(regions, BOUNDS, *columns)
     index.move(1, transform(translation=(2, 2, 2)))
@@ -126,7 +126,7 @@ def test_wrong_objects_are_refused(change: dict[str, np.ndarray], message: str) 
         "models": np.zeros(1, np.uint16),
         "region_of": np.zeros(1, np.int32),
         "positions": np.zeros((1, 3), np.float32),
-        "quaternions": np.float32([[1, 0, 0, 0]]),
+        "quaternions": np.array([[1, 0, 0, 0]], np.float32),
     }
     with pytest.raises(InvalidValueError, match=message):
         ObjectIndex(Regions([[0, 0, 0]], [[4, 4, 4]]), **{**columns, **change})  # type: ignore[arg-type]

@@ -12,10 +12,11 @@ from tests.raycast.paging.worlds import CAMERA, LIDAR, T_BASE_CAMERA, AllLive, s
 
 REACH = 18.0
 DEPTH = REACH / float(np.linalg.norm(CAMERA.directions, axis=1).max())
+REACH_OF_LIDAR = REACH / float(np.linalg.norm(LIDAR.directions, axis=1).max())
 
 
-def paged(made: rooms.Rooms, **settings: float) -> PagedScene:
-    return PagedScene(made.index, made.meshes, PagingConfig(**{"reach": REACH, **settings}))  # type: ignore[arg-type]
+def paged(made: rooms.Rooms, **settings: int) -> PagedScene:
+    return PagedScene(made.index, made.meshes, PagingConfig(reach=REACH, **settings))
 
 
 def random_pose(made: rooms.Rooms, rng: np.random.Generator) -> np.ndarray:
@@ -59,8 +60,7 @@ def test_rays_with_their_own_origins_equal_all_live() -> None:
             T = random_pose(made, rng)
             origins = T[:3, 3] + rng.uniform(-0.3, 0.3, (len(LIDAR), 3))
             hits = scene.cast_rays(origins, LIDAR.directions, packing=LIDAR)
-            limit = scene.config.reach / float(np.linalg.norm(LIDAR.directions, axis=1).max())
-            live.assert_same(hits, live.scene.cast_rays(origins, LIDAR.directions, None, limit, packing=LIDAR))
+            live.assert_same(hits, live.scene.cast_rays(origins, LIDAR.directions, None, REACH_OF_LIDAR, packing=LIDAR))
 
 
 def test_from_outside_of_all_regions_equals_all_live() -> None:
@@ -241,13 +241,26 @@ def test_objects_come_go_and_may_be_everywhere() -> None:
         assert one_ray(scene, (0, 0, 91), (0, 0, -1)) == floating
 
 
+def test_too_many_instances_are_refused_and_nothing_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = world()
+    T = rooms.drive(made, 1)[0]
+    T[2, 3] = 1.0
+    with paged(made) as scene:
+        monkeypatch.setattr("simtrack.raycast.paging.scene.MAX_INSTANCE", 100)
+        with pytest.raises(RaycastError, match="more than 100 instances"):
+            scene.cast(LIDAR, T)
+        assert 0 < scene.live_instances <= 100
+        monkeypatch.undo()
+        AllLive(scene).assert_same(scene.cast(LIDAR, T), AllLive(scene).scene.cast(LIDAR, T, REACH_OF_LIDAR))
+
+
 def test_misuse_is_refused() -> None:
     made = world(20)
     with pytest.raises(InvalidValueError, match="one for each model"):
         PagedScene(made.index, made.meshes[1:])
     for settings in ({"reach": 0.0}, {"reach": np.inf}, {"ahead": -1.0}, {"budget": 0}, {"linger": 0}):
         with pytest.raises(InvalidValueError, match="allowed"):
-            PagingConfig(**settings)
+            PagingConfig(**settings)  # pyright: ignore[reportArgumentType]
     scene = paged(made)
     for ask in (
         lambda: scene.cast(LIDAR, np.eye(4), np.inf),

@@ -1,0 +1,193 @@
+"""How time and memory grow with the world: a thousand objects in a hundred rooms to ten million in a million.
+
+A robot drives from room to room; in every frame the paged world follows, camera and lidar are cast into it, and up to
+ten visible objects are registered to the camera's depth. The rooms in the middle are the same in worlds of every size,
+so the frames of all sizes are the same, but for what lies farther away, and take turns. Apart from paging, the same
+rays are cast into scenes that hold whole worlds as Embree instances.
+"""
+
+import resource
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from simtrack.benchmarks import rooms
+from simtrack.benchmarks.harness import Benchmark, Options, Timing
+from simtrack.benchmarks.room_drive import PARTS, AllLive, PagedDrive, sensors
+from simtrack.benchmarks.yardstick import REFERENCE, scaled, yardstick
+from simtrack.contracts import Float64
+from simtrack.objects import load_object
+from simtrack.perception.tracking.target import tracked_model
+from simtrack.raycast import TriangleMesh
+from simtrack.raycast.scene import MAX_INSTANCE
+
+OBJECTS = ("klt3147", "materialbox", "relay", "screwdriver", "mug", "thermos")
+"""What stands in the rooms."""
+PAGED_ROOMS = (100, 1_000, 10_000, 100_000, 1_000_000)
+LIVE_ROOMS = (100, 300, 1_000, 3_000, 10_000, 30_000, 100_000)
+_QUICK = (20, 100)
+_STEP = 0.1
+"""Metres from frame to frame: 3 m/s at 30 Hz."""
+
+
+def run(options: Options) -> Benchmark:
+    """Measure worlds of `PAGED_ROOMS` and `LIVE_ROOMS`; small ones in a quick run."""
+    result = Benchmark("scaling")
+    models = [tracked_model(load_object(name)) for name in OBJECTS]
+    paged, live = (_QUICK, _QUICK) if options.quick else (PAGED_ROOMS, LIVE_ROOMS)
+    meshes, drives = [model.mesh for model in models], []
+    rooms.build(2, meshes, options.seed)  # the meshes of the rooms, which worlds of all sizes share
+    for count in paged:
+        options.say(f"building {count:,} rooms")
+        before, cpu, wall = _resident(), time.process_time(), time.perf_counter()
+        world = rooms.build(count, meshes, options.seed)
+        timing = Timing(time.process_time() - cpu, time.perf_counter() - wall, 1)
+        _report_world(result, world, timing, _resident() - before)
+        drives.append(PagedDrive(world, models, rooms.drive(world, 10 if options.quick else 300, _STEP)))
+    _drive_in_turn(drives, options)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
+    result.add("peak memory of the process, all worlds at once", value=peak, unit="GB", asked=4.0)
+    _report_drives(result, drives, REFERENCE if options.quick else yardstick(options.say))
+    _report_equality(result, next(d for d in drives if d.world.count == PAGED_ROOMS[0]), 3 if options.quick else 30)
+    for drive in drives:
+        drive.close()
+    worlds = {drive.world.count: drive.world for drive in drives}
+    del drives
+    _cast_at_whole_worlds(result, worlds, live, meshes, options)
+    result.plots["scaling.png"] = lambda path: _plot(result.series, path)
+    return result
+
+
+def _drive_in_turn(drives: Sequence[PagedDrive], options: Options) -> None:
+    """Frame by frame, every world takes its turn."""
+    pair = sensors()
+    frames = len(drives[0].poses)
+    for drive in drives:
+        for _ in range(2):
+            drive.step(0, pair, keep=False)
+    for number in range(frames):
+        if number % 50 == 0:
+            options.say(f"driving through {len(drives)} worlds, frame {number} of {frames}")
+        for drive in drives:
+            drive.step(number, pair)
+
+
+def _report_world(result: Benchmark, world: rooms.Rooms, timing: Timing, memory: float) -> None:
+    arrays = (world.index.nbytes + world.index.regions.nbytes) / world.objects
+    note = f"{memory / 1e6:.0f} MB more, {arrays:.0f} bytes an object"
+    asked = 60.0 if world.count == PAGED_ROOMS[-1] else None
+    result.add(f"build {world.count:,} rooms, {world.objects:,} objects", timing, asked=asked, note=note)
+
+
+def _report_drives(result: Benchmark, drives: Sequence[PagedDrive], pace: float) -> None:
+    for drive in drives:
+        medians = zip(PARTS, 1e3 * np.median(drive.cpu, axis=0), strict=True)
+        tail = 1e3 * np.percentile(drive.frames, (95, 100))
+        note = ", ".join(f"{name} {ms:.1f}" for name, ms in medians) + f"; p95 {tail[0]:.0f}, max {tail[1]:.0f} ms"
+        result.add(f"frame, {drive.world.objects:,} objects", drive.frame, note=note)
+    small, large = drives[0], drives[-1]
+    sizes = f"{large.world.objects:,}"
+    ratio = float(np.median(large.frames / small.frames))
+    result.add(f"frame, {sizes} : {small.world.objects:,} objects", value=ratio, unit="x", asked=1.5)
+    paging = 1e3 * np.array(large.cpu)[:, 0]
+    middle, p95, longest = np.percentile(paging, (50, 95, 100))
+    note = f"median {middle:.2f}, p95 {p95:.2f}; {np.mean(large.live):.0f} instances live, {large.loaded} were loaded"
+    asked, name = scaled(20.0, pace), f"paging in any frame, at most, {sizes} objects"
+    result.add(name, value=float(longest), unit="ms", asked=asked, note=note)
+    result.notes.append(f"{np.mean(large.tracked):.1f} objects are registered in a frame on average.")
+    result.series["paged.objects"] = [float(drive.world.objects) for drive in drives]
+    result.series["paged.frame_ms"] = [1e3 * drive.frame.cpu for drive in drives]
+    without_registration = [1e3 * np.array(drive.cpu)[:, :-1].sum(axis=1) for drive in drives]
+    result.series["paged.casts_ms"] = [float(np.median(ms)) for ms in without_registration]
+
+
+def _report_equality(result: Benchmark, drive: PagedDrive, frames: int) -> None:
+    pair, live = sensors(), AllLive(drive.world)
+    rays = differing = on_edges = 0
+    for pose in drive.poses[:: max(len(drive.poses) // frames, 1)]:
+        for sensor, hits in zip(pair, live.cast(pose, pair), strict=True):
+            paged = drive.scene.cast(sensor.bundle, pose @ sensor.T_base_sensor, sensor.reach)
+            counts = live.differing(paged, hits)
+            rays, differing, on_edges = rays + len(sensor.bundle), differing + counts[0], on_edges + counts[1]
+    live.scene.close()
+    name = f"{drive.world.objects:,} objects: rays that differ from all being live"
+    note = f"of {rays:,}, in object or by 1e-6 of the distance; {on_edges} name the other face of an edge"
+    result.add(name, value=differing, unit="rays", asked=0.0, note=note)
+
+
+def _cast_at_whole_worlds(
+    result: Benchmark,
+    worlds: dict[int, rooms.Rooms],
+    counts: Sequence[int],
+    meshes: Sequence[TriangleMesh],
+    options: Options,
+) -> None:
+    """The same casts against scenes that hold everything, in turn."""
+    pair, scenes = sensors(), []
+    before = _resident()
+    for count in counts:
+        world = worlds.get(count) or rooms.build(count, meshes, options.seed)
+        if AllLive.size(world) > MAX_INSTANCE:
+            result.notes.append(f"A scene holds {MAX_INSTANCE:,} instances: {world.objects:,} objects were left out.")
+            break
+        options.say(f"making {world.objects:,} objects live")
+        scenes.append(AllLive(world))
+    memory = (_resident() - before) / sum(AllLive.size(s.world) for s in scenes)
+    frames = 4 if options.quick else 60
+    drives = [rooms.drive(scene.world, frames, 5 * _STEP) for scene in scenes]
+    times = np.empty((frames, len(scenes)))
+    for number in range(-1, frames):  # the first turn does not count
+        for k, scene in enumerate(scenes):
+            start = time.process_time()
+            scene.cast(drives[k][number], pair)
+            times[number, k] = 1e3 * (time.process_time() - start)
+    sizes = np.array([AllLive.size(scene.world) for scene in scenes], float)
+    medians = np.median(times, axis=0)
+    for size, scene, milliseconds in zip(sizes, scenes, medians, strict=True):
+        name = f"casts, all live: {scene.world.objects:,} objects, {size:,.0f} instances"
+        result.add(name, Timing(1e-3 * milliseconds, 1e-3 * milliseconds, frames))
+        scene.scene.close()
+    result.notes.append(f"A live instance takes {memory:.0f} bytes.")
+    result.series |= {"live.instances": sizes.tolist(), "live.casts_ms": medians.tolist()}
+    result.series["live.objects"] = [float(scene.world.objects) for scene in scenes]
+    _fit(result, sizes, medians)
+
+
+def _fit(result: Benchmark, sizes: Float64, milliseconds: Float64) -> None:
+    """Least squares of ``c + a log m``; whether the largest scene takes longer than the others let expect."""
+    terms = np.stack([np.ones_like(sizes), np.log10(sizes)], axis=1)
+    (c, a), *_ = np.linalg.lstsq(terms, milliseconds)
+    residual = float(np.sqrt(np.mean((terms @ (c, a) - milliseconds) ** 2)))
+    name = f"c + a log10 m for all live: {c:.2f} + {a:.2f} log10 m ms, RMS residual"
+    result.add(name, value=residual, unit="ms", note=f"{100 * residual / milliseconds.mean():.1f} % of the mean")
+    result.series["live.fit"] = [float(c), float(a), residual]
+    if len(sizes) > 2:
+        (c, a), *_ = np.linalg.lstsq(terms[:-1], milliseconds[:-1])
+        excess = float(milliseconds[-1] / (terms[-1] @ (c, a)))
+        name = f"{sizes[-1]:,.0f} instances : the fit to the smaller scenes"
+        result.add(name, value=excess, unit="x")
+
+
+def _resident() -> float:
+    """Resident memory of the process, bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+def _plot(series: dict[str, list[float]], path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(series["paged.objects"], series["paged.frame_ms"], "o-", label="paged: whole frame")
+    axes.plot(series["paged.objects"], series["paged.casts_ms"], "o-", label="paged: paging and casts")
+    axes.plot(series["live.objects"], series["live.casts_ms"], "s-", label="all live: casts")
+    c, a, _ = series["live.fit"]
+    axes.plot(
+        series["live.objects"], c + a * np.log10(series["live.instances"]), "k:", label=f"{c:.1f} + {a:.1f} log m"
+    )
+    axes.set(xscale="log", xlabel="objects in the world", ylabel="CPU time, ms", ylim=(0.0, None))
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=120)
