@@ -12,7 +12,7 @@ Conventions (used everywhere in simtrack)
   ``t_true = t + rho``, ``R_true = Exp(phi) @ R`` for ``xi = (rho, phi)`` (see `simtrack.geometry.transforms.perturb`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol, TypeAlias, runtime_checkable
@@ -263,6 +263,10 @@ class TrackStatus(StrEnum):
     """Should be visible and is not: about to be pruned unless found again."""
 
 
+BELIEVED = (TrackStatus.CONFIRMED, TrackStatus.OCCLUDED, TrackStatus.OUT_OF_VIEW)
+"""Statuses of tracks that count as knowledge: confirmed once, and nothing has refuted them."""
+
+
 @dataclass(frozen=True, slots=True)
 class Track:
     """One believed object."""
@@ -295,7 +299,7 @@ class Track:
     @property
     def believed(self) -> bool:
         """Whether the track counts as knowledge (it was confirmed, and nothing has refuted it)."""
-        return self.status in (TrackStatus.CONFIRMED, TrackStatus.OCCLUDED, TrackStatus.OUT_OF_VIEW)
+        return self.status in BELIEVED
 
 
 @dataclass(frozen=True, slots=True)
@@ -428,8 +432,8 @@ class Belief:
     """Pre-segmentation of this frame's depth, if it was computed."""
     lidar: Presegmentation | None
     """Pre-segmentation of the latest scan."""
-    relations: frozenset[Relation]
-    """Relations that hold now, between entities named as in the graph (``relay-3``, ``workbench``)."""
+    relations: Set[Relation]
+    """Relations that held at `stamp`, between entities named as in the graph (``relay-3``, ``workbench``)."""
     status: Mapping[str, Status] = field(default_factory=dict)
     """Stage name -> how it fared."""
     stage_seconds: Mapping[str, float] = field(default_factory=dict)

@@ -1,7 +1,7 @@
 """What a run leaves in memory for its report: plain data, bounded, with no reference to the simulation."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,7 +37,7 @@ class KeyFrame:
     T_map_camera: Float64
     """(4, 4), believed."""
     tracks: tuple[Track, ...]
-    relations: frozenset[Relation]
+    relations: Set[Relation]
     objects: tuple[ObjectFrame, ...]
     """Truth and errors at the stamp."""
 

@@ -12,7 +12,7 @@ Definitions
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,7 +62,7 @@ class RelationEvaluator:
         self._counts = {name: _Counts() for name in RELATIONS}
         self._support = _Counts()
 
-    def observe(self, believed: frozenset[Relation], frames: Sequence[ObjectFrame], truth: "Truth") -> None:
+    def observe(self, believed: Set[Relation], frames: Sequence[ObjectFrame], truth: "Truth") -> None:
         """Take the relations of one belief with the object-frames of its stamp."""
         from simtrack.perception.scene_graph import relation_margins
 
@@ -90,7 +90,7 @@ class RelationEvaluator:
 
     def _count_support(
         self,
-        believed: frozenset[Relation],
+        believed: Set[Relation],
         tracked: Sequence[ObjectFrame],
         contacts: Iterable[tuple[str, str]],
         objects: set[str],

@@ -164,6 +164,14 @@ def distance_apart(ca, Ra, ha, cb, Rb, hb, bound, point_a, point_b):
 
 
 @njit(cache=True, nogil=True)
+def corner_distance(ca, Ra, ha, cb, Rb, hb):
+    """Distance of two disjoint boxes if a corner of one of them is closest to the other, else an upper bound of it."""
+    p = np.empty(3)
+    q = np.empty(3)
+    return _corners_to_box(cb, Rb, hb, ca, Ra, ha, _corners_to_box(ca, Ra, ha, cb, Rb, hb, np.inf, p, q), p, q)
+
+
+@njit(cache=True, nogil=True)
 def _corners_to_box(ca, Ra, ha, cb, Rb, hb, best, point_a, point_b):
     p = np.empty(3)
     q = np.empty(3)

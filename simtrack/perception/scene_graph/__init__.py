@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from simtrack.perception.scene_graph.bodies import Body
     from simtrack.perception.scene_graph.facts import Entity, Layer, SceneFacts, load_graph
     from simtrack.perception.scene_graph.graph import SceneGraph, SceneGraphConfig
     from simtrack.perception.scene_graph.history import Event, History, Interval
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from simtrack.perception.scene_graph.relations import (
         DIRECTIONS,
         RELATIONS,
-        Body,
         RelationConfig,
         relation_margin,
         relation_margins,
@@ -34,11 +34,12 @@ if TYPE_CHECKING:
     )
 
 _HOME = {
+    "bodies": ("Body",),
     "facts": ("Entity", "Layer", "SceneFacts", "load_graph"),
     "graph": ("SceneGraph", "SceneGraphConfig"),
     "history": ("Event", "History", "Interval"),
     "query": ("Query", "parse_query"),
-    "relations": ("DIRECTIONS", "RELATIONS", "Body", "RelationConfig", "relation_margin", "relation_margins"),
+    "relations": ("DIRECTIONS", "RELATIONS", "RelationConfig", "relation_margin", "relation_margins"),
     "shapes": ("HeightField", "Interior", "ModelLike", "Shape", "box_shape", "map_entity_shape", "model_shape"),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}

@@ -1,6 +1,6 @@
 """What a scene graph knows: entities, relations, their history; and the ways to ask it."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -12,17 +12,11 @@ from simtrack.contracts import Float64, Relation, Room
 from simtrack.errors import QueryError, UnknownNameError
 from simtrack.geometry.boxes import BoxProximity, OrientedBox, proximity
 from simtrack.perception.scene_graph import kernels
+from simtrack.perception.scene_graph.bodies import Body, BodyArrays
 from simtrack.perception.scene_graph.history import History, Interval
 from simtrack.perception.scene_graph.query import Query, parse_query
-from simtrack.perception.scene_graph.relations import (
-    DIRECTIONS,
-    RELATIONS,
-    Body,
-    BodyArrays,
-    RelationConfig,
-    relation_margin,
-    room_margins,
-)
+from simtrack.perception.scene_graph.relations import DIRECTIONS, RELATIONS, RelationConfig, relation_margin
+from simtrack.perception.scene_graph.rooms import room_margins
 from simtrack.perception.scene_graph.shapes import Shape
 
 if TYPE_CHECKING:
@@ -147,8 +141,8 @@ class SceneFacts:
     # ------------------------------------------------------------------------------------------------------ relations
 
     @property
-    def relations(self) -> frozenset[Relation]:
-        """Relations that hold now (live variants)."""
+    def relations(self) -> Set[Relation]:
+        """Relations that hold now (live variants); stays as it is when the graph goes on."""
         return self.recorded.current
 
     def at(self, stamp: int) -> frozenset[Relation]:

@@ -1,34 +1,29 @@
 """The live scene graph: rooms, static map and believed objects, brought up to date frame by frame.
 
 Only pairs in which something moved are evaluated again. What stands on or in a supporter that moves is carried along
-until it is observed itself: T_supporter_child = T_map_supporter^-1 T_map_child is kept from when the child was last
-seen, and T_map_child = T_map_supporter T_supporter_child since then: the tracking paper's T_m^c = T_m^t T_t^c (III.D).
+until it is observed itself (see `motion`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, compress
 
 import numpy as np
 
-from simtrack.contracts import Float64, MapEntity, Relation, Room, StaticMap, Status, Track
+from simtrack.contracts import BELIEVED, Float64, MapEntity, Relation, Room, StaticMap, Status, Track
 from simtrack.errors import InvalidValueError, UnknownNameError
-from simtrack.geometry.transforms import angle_between, inverse, transform
+from simtrack.geometry.transforms import inverse, transform
 from simtrack.objects.semantics import SEMANTIC_CLASSES
 from simtrack.perception.scene_graph import kernels
+from simtrack.perception.scene_graph.bodies import Body, BodyArrays
 from simtrack.perception.scene_graph.facts import Entity, Layer, SceneFacts
 from simtrack.perception.scene_graph.history import History
-from simtrack.perception.scene_graph.relations import (
-    RELATIONS,
-    Body,
-    BodyArrays,
-    RelationConfig,
-    room_margins,
-)
+from simtrack.perception.scene_graph.motion import NONE, Motion
+from simtrack.perception.scene_graph.pairs import PairTable
+from simtrack.perception.scene_graph.relations import RELATIONS, RelationConfig
+from simtrack.perception.scene_graph.rooms import RoomIndex
 from simtrack.perception.scene_graph.shapes import ModelLike, Shape, map_entity_shape, model_shape
-
-_NONE, _HELD = -1, -2
-"""Supporter slots: none; gone while it carried the child, which stays where it was carried to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,20 +83,27 @@ class SceneGraph(SceneFacts):
         self._model_shapes = {name: model_shape(model) for name, model in models.items()}
         self._arrays = BodyArrays({f"model:{name}": shape for name, shape in self._model_shapes.items()}, rules)
         capacity = len(self._arrays.alive)
-        self._bits = np.zeros((capacity, capacity), dtype=np.uint16)
-        self._T = np.tile(np.eye(4), (capacity, 1, 1))
-        self._T_evaluated = self._T.copy()
-        self._T_seen = self._T.copy()
-        self._T_supporter_seen = self._T.copy()
-        self._supporter_seen = np.full(capacity, _NONE)
-        self._parent = np.full(capacity, _NONE)
-        self._carried = np.zeros(capacity, dtype=np.bool_)
+        self._pairs = PairTable()
+        self._motion = Motion(
+            capacity,
+            move=(self.config.move_translation, self.config.move_rotation),
+            carry=(self.config.carry_translation, self.config.carry_rotation),
+        )
+        self._parent = np.full(capacity, NONE)
         self._names: dict[int, str] = {}
         self._slots: dict[str, int] = {}
-        self._tracks: dict[tuple[str, int], int] = {}
-        self._rests_on: dict[int, set[int]] = {}
+        self._tracked = np.zeros(capacity, dtype=np.bool_)
+        self._tracks: dict[str, dict[int, int]] = {name: {} for name in models}
+        self._keys: dict[int, tuple[str, int]] = {}
+        self._last_keys: tuple[list[str], list[int]] = [], []
+        self._last_slots = np.zeros(0, dtype=np.int64)
+        self._near_below: dict[int, set[int]] = {}
+        self._near_above: dict[int, set[int]] = {}
+        self._inside: dict[int, set[int]] = {}
         self._stands_on: dict[int, set[int]] = {}
-        self._room: dict[int, str] = {}
+        self._room_index = RoomIndex(list(self.rooms.values()))
+        self._room_names = list(self.rooms)
+        self._room = np.full(capacity, NONE)
         self._static: dict[int, MapEntity] = {}
         self._table: dict[str, Entity] | None = None
         if static_map is not None:
@@ -109,7 +111,7 @@ class SceneGraph(SceneFacts):
 
     # --------------------------------------------------------------------------------------------------------- update
 
-    def update(self, stamp: int, tracks: Sequence[Track]) -> frozenset[Relation]:
+    def update(self, stamp: int, tracks: Sequence[Track]) -> Set[Relation]:
         """Bring the graph up to date with the tracks of one frame and return the relations that hold.
 
         Only believed tracks enter; tracks that are not in `tracks` any more leave. A track whose pose is not finite
@@ -121,117 +123,82 @@ class SceneGraph(SceneFacts):
         if stamp <= self.stamp:
             self.status = Status.STALE
             return self.relations
-        believed = [track for track in tracks if track.believed]
-        poses = np.array([track.T_map_object for track in believed], dtype=float).reshape(-1, 4, 4)
-        finite = np.all(np.isfinite(poses), axis=(1, 2))
-        self.status = Status.OK if finite.all() else Status.DEGRADED
-        self._require_models(believed)
+        believed = [track for track in tracks if track.status in BELIEVED]
+        slots = self._find(believed)
+        poses = np.concatenate([track.T_map_object for track in believed] or [np.zeros((0, 4))]).reshape(-1, 4, 4)
+        observed = np.array([track.last_seen >= track.stamp for track in believed], dtype=np.bool_)
         self.stamp = stamp
         self._table = None
+        self.status = Status.OK
 
-        self._retire(stamp, {(track.class_name, track.id) for track in believed})
-        fresh, slots, observed = self._admit(believed, poses, finite)
-        self._place(slots, poses[finite], observed)
-        moved = self._find_moved(fresh)
-        if len(moved):
-            self._relate(stamp, moved)
-        self._remember(slots[observed])
+        self._retire(stamp, slots)
+        if not np.isfinite(poses).all():
+            self.status = Status.DEGRADED
+            finite = np.all(np.isfinite(poses.reshape(-1, 16)), axis=1)
+            believed = list(compress(believed, finite))
+            slots, poses, observed = slots[finite], poses[finite], observed[finite]
+        self._admit(believed, slots, poses)
+        self._motion.place(slots, poses, observed)
+        self._relate(stamp, self._motion.moved(slots))
+        self._motion.remember(slots, observed, self._parent)
         return self.relations
 
-    def _require_models(self, tracks: Sequence[Track]) -> None:
-        for track in tracks:
-            if track.class_name not in self._model_shapes:
-                raise UnknownNameError("object model", track.class_name, self._model_shapes)
+    def _find(self, tracks: Sequence[Track]) -> np.ndarray:
+        """Slots of the tracks, NONE for new ones; those of the last frame if it had the same tracks."""
+        keys = [track.class_name for track in tracks], [track.id for track in tracks]
+        if keys != self._last_keys:
+            try:
+                found = [self._tracks[name].get(number, NONE) for name, number in zip(*keys, strict=True)]
+            except KeyError as error:
+                raise UnknownNameError("object model", str(error.args[0]), self._tracks) from None
+            self._last_keys, self._last_slots = keys, np.array(found, dtype=np.int64)
+        return self._last_slots
 
-    def _retire(self, stamp: int, keys: set[tuple[str, int]]) -> None:
-        """Take out the tracks that are no longer believed."""
-        for key in [key for key in self._tracks if key not in keys]:
-            slot = self._tracks.pop(key)
-            gone = np.nonzero(self._bits[slot] | self._bits[:, slot])[0]
-            rows = [(a, b, self._bits[a, b], 0) for o in gone for a, b in ((slot, o), (o, slot)) if self._bits[a, b]]
-            self._apply(stamp, np.array(rows, dtype=np.int64).reshape(-1, 4))
-            self._bits[slot, :] = self._bits[:, slot] = 0
-            self._enter_room(stamp, slot, "")
-            children = np.nonzero(self._supporter_seen == slot)[0]
-            self._supporter_seen[children] = np.where(self._carried[children], _HELD, _NONE)
-            self._supporter_seen[slot] = self._parent[slot] = _NONE
-            self._carried[slot] = False
+    def _retire(self, stamp: int, slots: np.ndarray) -> None:
+        """Take out the tracks that are not among those in `slots` any more."""
+        gone = self._tracked.copy()
+        gone[slots[slots != NONE]] = False
+        if not gone.any():
+            return
+        left = np.nonzero(gone)[0]
+        self._apply(stamp, self._pairs.drop(self._arrays.world, np.nonzero(self._arrays.alive)[0], gone))
+        self._motion.leave(left)
+        self._tracked[left] = False
+        for slot in left.tolist():
+            self._enter_room(stamp, slot, NONE)
+            self._parent[slot] = NONE
             self._arrays.remove(slot)
+            class_name, number = self._keys.pop(slot)
+            del self._tracks[class_name][number]
             del self._slots[self._names.pop(slot)]
 
-    def _admit(
-        self, tracks: Sequence[Track], poses: Float64, finite: np.ndarray
-    ) -> tuple[list[int], np.ndarray, np.ndarray]:
-        """Slots of the tracks with a finite pose; which slots are new, and which tracks were observed in this frame."""
-        fresh: list[int] = []
-        slots: list[int] = []
-        observed: list[bool] = []
-        for track, pose, usable in zip(tracks, poses, finite, strict=True):
-            if not usable:
-                continue
-            key = (track.class_name, track.id)
-            slot = self._tracks.get(key)
-            seen = track.last_seen >= track.stamp
-            if slot is None:
-                name, model = f"{track.class_name}-{track.id}", track.class_name
-                slot = self._add(name, f"model:{model}", pose)
-                self._tracks[key] = slot
-                self.known[name] = (model, self.models[model], Layer.OBJECT)
-                fresh.append(slot)
-            slots.append(slot)
-            observed.append(seen)
-        return fresh, np.array(slots, dtype=np.int64), np.array(observed, dtype=np.bool_)
-
-    def _place(self, slots: np.ndarray, poses: Float64, observed: np.ndarray) -> None:
-        """Take the tracks' poses, and those of supporters that moved for what could not be seen."""
-        held = ~observed & (self._supporter_seen[slots] == _HELD)
-        self._T[slots[~held]] = poses[~held]
-        self._carried[slots] = held
-        pending = {int(slot) for slot in slots[~observed & (self._supporter_seen[slots] >= 0)]}
-        while pending:
-            self._carry(pending.pop(), pending)
-
-    def _carry(self, slot: int, pending: set[int]) -> None:
-        """Move a child with its supporter, the supporter first if it is a carried child itself."""
-        supporter = int(self._supporter_seen[slot])
-        if supporter in pending:
-            pending.remove(supporter)
-            self._carry(supporter, pending)
-        T_now, T_then = self._T[supporter], self._T_supporter_seen[slot]
-        shift = float(np.linalg.norm(T_now[:3, 3] - T_then[:3, 3]))
-        turn = angle_between(T_now[:3, :3], T_then[:3, :3])
-        if shift > self.config.carry_translation or turn > self.config.carry_rotation:
-            self._T[slot] = T_now @ inverse(T_then) @ self._T_seen[slot]
-            self._carried[slot] = True
-
-    def _find_moved(self, fresh: Sequence[int]) -> np.ndarray:
-        """Slots whose pose differs from the one last evaluated by more than the tolerance."""
-        slots = np.fromiter(self._tracks.values(), dtype=np.int64, count=len(self._tracks))
-        change = self._T[slots, :3] - self._T_evaluated[slots, :3]
-        shifted = (change[:, :, 3] ** 2).sum(axis=1) > self.config.move_translation**2
-        # |R - S|^2 = 8 sin^2(angle / 2) in the Frobenius norm.
-        turned = (change[:, :, :3] ** 2).sum(axis=(1, 2)) > 8.0 * np.sin(0.5 * self.config.move_rotation) ** 2
-        return slots[shifted | turned | np.isin(slots, fresh)]
+    def _admit(self, tracks: Sequence[Track], slots: np.ndarray, poses: Float64) -> None:
+        """Give the new ones among the tracks a slot."""
+        for row in np.nonzero(slots == NONE)[0].tolist():
+            class_name, number = tracks[row].class_name, tracks[row].id
+            if number not in self._tracks[class_name]:
+                name = f"{class_name}-{number}"
+                slot = self._add(name, f"model:{class_name}", poses[row])
+                self._tracks[class_name][number] = slot
+                self._keys[slot] = class_name, number
+                self._tracked[slot] = True
+                self.known[name] = (class_name, self.models[class_name], Layer.OBJECT)
+            slots[row] = self._tracks[class_name][number]
 
     def _relate(self, stamp: int, moved: np.ndarray) -> None:
         """Evaluate the pairs of the slots that moved."""
-        self._T_evaluated[moved] = self._T[moved]
-        self._arrays.set_poses(moved, self._T[moved])
+        if not len(moved):
+            return
+        poses = self._motion.T[moved]
+        shift = np.zeros(len(self._arrays.alive))
+        shift[moved] = np.linalg.norm(poses[:, :3, 3] - self._arrays.world.centres[moved], axis=1)
+        self._arrays.set_poses(moved, poses)
+        self._motion.evaluated(moved)
         flags = np.zeros(len(self._arrays.alive), dtype=np.bool_)
         flags[moved] = True
-        slots = np.nonzero(self._arrays.alive)[0]
-        parameters = self.relation_config.parameters()
-        changes = kernels.update_pairs(self._arrays.world, slots, flags, self._bits, parameters)
-        self._apply(stamp, changes)
+        slots, parameters = np.nonzero(self._arrays.alive)[0], self.relation_config.parameters()
+        self._apply(stamp, self._pairs.update(self._arrays.world, slots, flags, shift, parameters))
         self._assign_rooms(stamp, moved)
-
-    def _remember(self, observed: np.ndarray) -> None:
-        """Keep how observed children lie to their supporters."""
-        parents = self._parent[observed]
-        self._T_seen[observed] = self._T[observed]
-        self._supporter_seen[observed] = parents
-        standing = parents >= 0
-        self._T_supporter_seen[observed[standing]] = self._T[parents[standing]]
 
     # ------------------------------------------------------------------------------------------------------ relations
 
@@ -242,16 +209,17 @@ class SceneGraph(SceneFacts):
         for a, b, old, new in changes.tolist():
             difference = old ^ new
             if difference >> kernels.ON & 1:
-                self._rests_on[a].symmetric_difference_update({b})
+                self._near_below[a] ^= {b}
+                self._near_above[b] ^= {a}
                 restless.add(a)
             if difference >> kernels.IN & 1:
+                self._inside[a] ^= {b}
                 unsettled.add(a)
             for r in range(1, kernels.COUNT):
                 if difference >> r & 1:
                     self._write(stamp, Relation(self._names[a], RELATIONS[r], self._names[b]), bool(new >> r & 1))
-        if restless:
-            # What stands on something that came to stand on something else may be affected, too.
-            restless |= {a for a, below in self._rests_on.items() if not below.isdisjoint(restless)}
+        # What stands on something that came to stand on something else may be affected, too.
+        restless = restless.union(*(self._near_above[a] for a in restless))
         for a in restless:
             self._settle(stamp, a)
         for a in restless | unsettled:
@@ -259,8 +227,8 @@ class SceneGraph(SceneFacts):
 
     def _settle(self, stamp: int, slot: int) -> None:
         """Publish `on` for the direct supporters: not for what only lies within reach below one of them."""
-        below = self._rests_on[slot]
-        direct = {b for b in below if not any(b in self._rests_on[c] for c in below if c != b)}
+        below = self._near_below[slot]
+        direct = {b for b in below if not any(b in self._near_below[c] for c in below if c != b)}
         for other in direct ^ self._stands_on[slot]:
             self._write(stamp, Relation(self._names[slot], "on", self._names[other]), other in direct)
         self._stands_on[slot] = direct
@@ -274,12 +242,14 @@ class SceneGraph(SceneFacts):
     def _find_parent(self, slot: int) -> int:
         """The supporter with the least gap, else the innermost container, else none; the present one is preferred."""
         world, current = self._arrays.world, int(self._parent[slot])
-        holding = self._stands_on[slot] or set(np.nonzero(self._bits[slot] >> kernels.IN & 1)[0].tolist())
+        holding = self._stands_on[slot] or self._inside[slot]
         holding = {b for b in holding if not self._descends(b, slot)}
         if not holding:
-            return _NONE
+            return NONE
         if current in holding:
             return current
+        if len(holding) == 1:
+            return holding.pop()
         return min(holding, key=lambda b: (kernels.clearance(world, slot, b), float(world.radii[b]), b))
 
     def _descends(self, slot: int, ancestor: int) -> bool:
@@ -290,28 +260,23 @@ class SceneGraph(SceneFacts):
         return False
 
     def _assign_rooms(self, stamp: int, slots: np.ndarray) -> None:
-        if not self.rooms or not len(slots):
+        if not self.rooms:
             return
-        rooms = list(self.rooms.values())
-        points = self._T[slots, :3, 3]
-        margins = np.stack([_room_margins(points, room) for room in rooms], axis=1)
-        for row, slot in enumerate(slots.tolist()):
-            if slot in self._static and self._static[slot].room in self.rooms:
-                continue
-            current = self._room.get(slot, "")
-            best = int(np.argmax(margins[row]))
-            stays = [i for i, room in enumerate(rooms) if room.name == current]
-            if stays and margins[row, stays[0]] >= -self.relation_config.leave_margin:
-                continue
-            self._enter_room(stamp, slot, rooms[best].name if margins[row, best] >= 0.0 else "")
+        current = self._room[slots]
+        leave_margin = self.relation_config.leave_margin
+        rooms = self._room_index.assign(self._motion.T[slots, :3, 3], current, leave_margin)
+        for row in np.nonzero(rooms != current)[0].tolist():
+            slot, room = int(slots[row]), int(rooms[row])
+            if slot not in self._static or self._static[slot].room not in self.rooms:
+                self._enter_room(stamp, slot, room)
 
-    def _enter_room(self, stamp: int, slot: int, room: str) -> None:
-        current = self._room.get(slot, "")
+    def _enter_room(self, stamp: int, slot: int, room: int) -> None:
+        current = int(self._room[slot])
         if current != room:
-            if current:
-                self.recorded.end(stamp, Relation(self._names[slot], "in", current))
-            if room:
-                self.recorded.begin(stamp, Relation(self._names[slot], "in", room))
+            if current != NONE:
+                self.recorded.end(stamp, Relation(self._names[slot], "in", self._room_names[current]))
+            if room != NONE:
+                self.recorded.begin(stamp, Relation(self._names[slot], "in", self._room_names[room]))
         self._room[slot] = room
 
     # ------------------------------------------------------------------------------------------------------- entities
@@ -328,25 +293,21 @@ class SceneGraph(SceneFacts):
         """(4, 4) pose that an object has if it moves with what it stood on or in when last seen; None if on nothing."""
         if child not in self._slots:
             raise UnknownNameError("object", child, self._slots)
-        slot = self._slots[child]
-        supporter = int(self._supporter_seen[slot])
-        if supporter < 0:
-            return None
-        return self._T[supporter] @ inverse(self._T_supporter_seen[slot]) @ self._T_seen[slot]
+        return self._motion.carried_pose(self._slots[child])
 
     def body(self, name: str) -> Body:
         """Shape and pose of a static entity or an object."""
         if name in self._slots:
-            return Body(self._shape(name), self._T[self._slots[name]].copy())
+            return Body(self._shape(name), self._motion.T[self._slots[name]].copy())
         return super().body(name)
 
     def _entity(self, slot: int) -> Entity:
         name = self._names[slot]
         class_name, semantic_class, layer = self.known[name]
-        parent, room = int(self._parent[slot]), self._room.get(slot, "")
-        T_map = self._T[slot].copy()
+        parent, room = int(self._parent[slot]), self._room_name(slot)
+        T_map = self._motion.T[slot].copy()
         if parent >= 0:
-            T_parent_entity = inverse(self._T[parent]) @ T_map
+            T_parent_entity = inverse(self._motion.T[parent]) @ T_map
         elif room:
             T_parent_entity = inverse(_room_entity(self.rooms[room]).T_map) @ T_map
         else:
@@ -361,8 +322,11 @@ class SceneGraph(SceneFacts):
             room=room,
             parent=self._names[parent] if parent >= 0 else room,
             T_parent_entity=T_parent_entity,
-            carried=bool(self._carried[slot]),
+            carried=bool(self._motion.carried[slot]),
         )
+
+    def _room_name(self, slot: int) -> str:
+        return self._room_names[self._room[slot]] if self._room[slot] != NONE else ""
 
     def _shape(self, name: str) -> Shape:
         class_name, _, layer = self.known[name]
@@ -373,34 +337,26 @@ class SceneGraph(SceneFacts):
 
     def _add(self, name: str, kind: str, T_map: Float64) -> int:
         slot = self._arrays.add(kind, T_map)
-        if slot >= len(self._bits):
-            self._grow(len(self._arrays.alive))
-        self._T[slot] = self._T_evaluated[slot] = T_map
+        capacity = len(self._arrays.alive)
+        if slot >= len(self._parent):
+            self._motion.grow(capacity)
+            more = capacity - len(self._parent)
+            self._parent = np.concatenate([self._parent, np.full(more, NONE)])
+            self._room = np.concatenate([self._room, np.full(more, NONE)])
+            self._tracked = np.concatenate([self._tracked, np.zeros(more, dtype=np.bool_)])
+        self._motion.enter(slot, T_map)
         self._names[slot], self._slots[name] = name, slot
-        self._rests_on[slot], self._stands_on[slot] = set(), set()
-        self._room[slot] = ""
+        self._near_below[slot], self._near_above[slot] = set(), set()
+        self._inside[slot], self._stands_on[slot] = set(), set()
+        self._room[slot] = NONE
         return slot
-
-    def _grow(self, capacity: int) -> None:
-        old = len(self._bits)
-        bits = np.zeros((capacity, capacity), dtype=np.uint16)
-        bits[:old, :old] = self._bits
-        self._bits = bits
-        for attribute in ("_T", "_T_evaluated", "_T_seen", "_T_supporter_seen"):
-            grown = np.tile(np.eye(4), (capacity, 1, 1))
-            grown[:old] = getattr(self, attribute)
-            setattr(self, attribute, grown)
-        nothing = np.full(capacity - old, _NONE)
-        self._supporter_seen = np.concatenate([self._supporter_seen, nothing])
-        self._parent = np.concatenate([self._parent, nothing])
-        self._carried = np.concatenate([self._carried, np.zeros(capacity - old, dtype=np.bool_)])
 
     def _add_static_map(self, static_map: StaticMap) -> None:
         """Enter rooms and map entities and relate them once; their relations hold from stamp 0."""
         rules = self.relation_config
-        names = [room.name for room in static_map.rooms] + [entity.name for entity in static_map.entities]
-        for name in names:
-            if names.count(name) > 1:
+        names = Counter(thing.name for thing in (*static_map.rooms, *static_map.entities))
+        for name, count in names.items():
+            if count > 1:
                 raise InvalidValueError("StaticMap names", name, "names that are unique among rooms and entities")
         for room in static_map.rooms:
             self.known[room.name] = ("room", "room", Layer.ROOM)
@@ -412,16 +368,8 @@ class SceneGraph(SceneFacts):
             self.known[entity.name] = (entity.semantic_class, entity.semantic_class, Layer.STATIC)
             self._static[slot] = entity
             if entity.room in self.rooms:
-                self._enter_room(0, slot, entity.room)
-        slots = np.array(sorted(self._static), dtype=np.int64)
-        if len(slots):
-            self._relate(0, slots)
-
-
-def _room_margins(points: Float64, room: Room) -> Float64:
-    """(N,) metres from the walls, -inf above or below the room."""
-    level = (points[:, 2] >= room.floor - 0.5) & (points[:, 2] <= room.floor + room.height)
-    return np.where(level, room_margins(points, room), -np.inf)
+                self._enter_room(0, slot, self._room_names.index(entity.room))
+        self._relate(0, np.array(sorted(self._static), dtype=np.int64))
 
 
 def _room_entity(room: Room) -> Entity:

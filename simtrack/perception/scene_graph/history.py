@@ -1,7 +1,7 @@
 """When which relation held."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Set
+from typing import Any, NamedTuple
 
 from simtrack.contracts import Relation
 
@@ -27,6 +27,40 @@ class Event(NamedTuple):
     begins: bool
 
 
+class RelationSet(Set[Relation]):
+    """The relations that held at one time: a set that looks into the history and copies nothing.
+
+    It stays as it is while the history goes on. Membership and size cost next to nothing, whatever the number of
+    relations; only who iterates pays for all of them. Combined with other sets it gives a `frozenset`.
+    """
+
+    __slots__ = ("_history", "_size", "_stamp")
+
+    def __init__(self, history: "History", stamp: int, size: int) -> None:
+        self._history = history
+        self._stamp = stamp
+        self._size = size
+
+    def __contains__(self, relation: object) -> bool:
+        return isinstance(relation, Relation) and self._history.held(relation, self._stamp)
+
+    def __iter__(self) -> Iterator[Relation]:
+        return iter(self._history.at(self._stamp))
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __repr__(self) -> str:
+        return f"<{self._size} relations at {self._stamp} ns>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return frozenset, (tuple(self),)
+
+    @classmethod
+    def _from_iterable(cls, relations: Iterable[Any]) -> frozenset[Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return frozenset(relations)
+
+
 class History:
     """For each relation its intervals, in order and disjoint, and all changes in order of time."""
 
@@ -46,11 +80,13 @@ class History:
         self.events.sort(key=lambda event: event.stamp)
 
     @property
-    def current(self) -> frozenset[Relation]:
-        """Relations that hold now."""
-        if self._frozen is None:
-            self._frozen = frozenset(self._current)
-        return self._frozen
+    def current(self) -> RelationSet:
+        """Relations that hold now; not changed by what begins or ends at a later stamp."""
+        return RelationSet(self, self._last, len(self._current))
+
+    @property
+    def _last(self) -> int:
+        return self.events[-1].stamp if self.events else -1
 
     def begin(self, stamp: int, relation: Relation) -> None:
         """Note that a relation holds from `stamp`, nanoseconds; no effect if it holds already.
@@ -99,8 +135,16 @@ class History:
         """Intervals during which a relation held, earliest first; empty if it never did."""
         return tuple(self._intervals.get(relation, ()))
 
+    def held(self, relation: Relation, stamp: int) -> bool:
+        """Whether a relation held at `stamp`, nanoseconds."""
+        return any(span.covers(stamp) for span in reversed(self._intervals.get(relation, ())))
+
     def at(self, stamp: int) -> frozenset[Relation]:
         """Relations that held at `stamp`, nanoseconds."""
+        if stamp >= self._last:
+            if self._frozen is None:
+                self._frozen = frozenset(self._current)
+            return self._frozen
         return frozenset(r for r, spans in self._intervals.items() if any(span.covers(stamp) for span in spans))
 
     def __iter__(self) -> Iterator[tuple[Relation, tuple[Interval, ...]]]:

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from simtrack.contracts import Bool, Float64, Int32
-from simtrack.geometry.boxes import signed_distance
+from simtrack.geometry.boxes import corner_distance, distance_apart, separation, signed_distance
 
 ON, IN, ABOVE, BELOW, LEFT, RIGHT, FRONT, BEHIND, NEAR, TOUCHING, INTERSECTS = range(11)
 COUNT = 11
@@ -50,6 +50,8 @@ class World(NamedTuple):
     """(F, 2)."""
     field_shapes: Int32
     """(F, 3), cells along x, cells along y, first cell in `heights`."""
+    field_ranges: Float64
+    """(F, 3), lowest and highest height, number of cells where there is a surface."""
     heights: Float64
     """(H,)."""
 
@@ -70,17 +72,20 @@ class Parameters(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def direction_margin(ca, Ra, ha, cb, Rb, hb, axis, sign, parameters, limit):
-    """Margin of body a lying in direction `sign * axis` of body b's box."""
-    strict = parameters.strict
-    t = np.empty(3)
-    e = np.empty(3)
+def relative_box(ca, Ra, ha, cb, Rb, t, e):
+    """Body a in the axes of body b: its box's centre into `t` (3,), half sides of the box around that into `e` (3,)."""
     for i in range(3):
         t[i] = 0.0
         e[i] = 0.0
         for k in range(3):
             t[i] += Rb[k, i] * (ca[k] - cb[k])
             e[i] += abs(Rb[0, i] * Ra[0, k] + Rb[1, i] * Ra[1, k] + Rb[2, i] * Ra[2, k]) * ha[k]
+
+
+@njit(cache=True, nogil=True)
+def direction_margin(ca, Ra, ha, cb, Rb, hb, t, e, axis, sign, parameters, limit):
+    """Margin of body a lying in direction `sign * axis` of body b's box; `t` and `e` are those of `relative_box`."""
+    strict = parameters.strict
     along = sign * t[axis] - hb[axis]
     if not parameters.projection:
         contained = along - e[axis]
@@ -88,46 +93,42 @@ def direction_margin(ca, Ra, ha, cb, Rb, hb, axis, sign, parameters, limit):
     length = 2.0 * parameters.projection_factor * hb[axis]
     i1 = (axis + 1) % 3
     i2 = (axis + 2) % 3
-    contained = min(along - e[axis], length - along - e[axis])
-    contained = min(contained, hb[i1] - abs(t[i1]) - e[i1], hb[i2] - abs(t[i2]) - e[i2])
+    # How deep the body's centre lies in the region along the region's axes, and how far the box reaches from there.
+    depth = min(along, length - along)
+    depth1 = hb[i1] - abs(t[i1])
+    depth2 = hb[i2] - abs(t[i2])
+    contained = min(depth - e[axis], depth1 - e[i1], depth2 - e[i2])
     if strict:
         return contained
+    # No shift by less than the least depth takes the centre out, none by more than the least overlap is needed.
+    least = max(contained, min(depth, depth1, depth2) - parameters.meet_depth)
+    most = max(contained, min(depth + e[axis], depth1 + e[i1], depth2 + e[i2]) - parameters.meet_depth)
+    if least > limit:
+        return least
+    if most < -limit:
+        return most
     half = np.empty(3)
+    centre = np.empty(3)
     for k in range(3):
         half[k] = hb[k]
     half[axis] = 0.5 * length
-    gap = abs(along - half[axis]) - half[axis] - e[axis]
-    gap = max(gap, abs(t[i1]) - hb[i1] - e[i1], abs(t[i2]) - hb[i2] - e[i2])
-    if gap > limit:
-        return -gap - parameters.meet_depth
-    centre = np.empty(3)
     for k in range(3):
         centre[k] = cb[k] + sign * (hb[axis] + half[axis]) * Rb[k, axis]
     return max(contained, -signed_distance(centre, Rb, half, ca, Ra, ha, limit) - parameters.meet_depth)
 
 
 @njit(cache=True, nogil=True)
-def in_margin(world, a, b, strict):
-    """Margin of body a being in body b."""
-    cb, Rb, hb = world.centres[b], world.rotations[b], world.halves[b]
-    ca, Ra, ha = world.centres[a], world.rotations[a], world.halves[a]
-    t = np.empty(3)
-    e = np.empty(3)
-    for i in range(3):
-        t[i] = 0.0
-        e[i] = 0.0
-        for k in range(3):
-            t[i] += Rb[k, i] * (ca[k] - cb[k])
-            e[i] += abs(Rb[0, i] * Ra[0, k] + Rb[1, i] * Ra[1, k] + Rb[2, i] * Ra[2, k]) * ha[k]
-    contained = min(hb[0] - abs(t[0]) - e[0], hb[1] - abs(t[1]) - e[1], hb[2] - abs(t[2]) - e[2])
-    half = world.interior_halves[b]
+def in_margin(centre, half, hb, t, e, strict):
+    """Margin of a body being in body b, whose interior is given; `t` and `e` are those of `relative_box`."""
     if half[2] <= 0.0:
         return -np.inf
-    for k in range(3):
-        t[k] -= world.interior_centres[b, k]
-    below_rim = half[2] - (t[2] - e[2]) - min(0.5 * e[2], half[2])
-    margin = min(half[0] - abs(t[0]), half[1] - abs(t[1]), below_rim, half[2] + t[2])
-    return min(margin, contained) if strict else margin
+    below_rim = half[2] - (t[2] - centre[2] - e[2]) - min(0.5 * e[2], half[2])
+    margin = min(
+        half[0] - abs(t[0] - centre[0]), half[1] - abs(t[1] - centre[1]), below_rim, half[2] + t[2] - centre[2]
+    )
+    if not strict:
+        return margin
+    return min(margin, hb[0] - abs(t[0]) - e[0], hb[1] - abs(t[1]) - e[1], hb[2] - abs(t[2]) - e[2])
 
 
 @njit(cache=True, nogil=True)
@@ -195,49 +196,54 @@ def _smallest(values, rank):
 
 
 @njit(cache=True, nogil=True)
+def _span(world, field, R, t, axis):
+    """Least and largest coordinate of a field's surface along an axis of the frame in which its pose is R, t."""
+    slack = 0.5 * (abs(R[axis, 0]) * world.field_sizes[field, 0] + abs(R[axis, 1]) * world.field_sizes[field, 1])
+    low = t[axis] + R[axis, 2] * world.field_ranges[field, 0]
+    high = t[axis] + R[axis, 2] * world.field_ranges[field, 1]
+    return min(low, high) - slack, max(low, high) + slack
+
+
+@njit(cache=True, nogil=True)
 def _contact_gap(world, body, field, other, first, count):
     """Gap between the cells of one field and the nearest of `count` surfaces of another body.
 
     It is the gap at the cell that completes the contact area (see `CONTACT_SHARE`), inf if fewer cells overlap.
     """
-    nu = world.field_shapes[field, 0]
-    nv = world.field_shapes[field, 1]
-    start = world.field_shapes[field, 2]
+    nu, nv, start = world.field_shapes[field, 0], world.field_shapes[field, 1], world.field_shapes[field, 2]
     du = world.field_sizes[field, 0] / nu
     dv = world.field_sizes[field, 1] / nv
-    gaps = np.empty(nu * nv)
-    own = 0.0
-    for i in range(nu * nv):
-        gaps[i] = np.inf
-        if world.heights[start + i] > -np.inf:
-            own += 1.0
+    heights = world.heights
+    gaps = np.full(nu * nv, np.inf)
     area = 0.0
     R = np.empty((3, 3))
     t = np.empty(3)
     for g in range(first, first + count):
-        mu = world.field_shapes[g, 0]
-        mv = world.field_shapes[g, 1]
-        origin = world.field_shapes[g, 2]
+        mu, mv, origin = world.field_shapes[g, 0], world.field_shapes[g, 1], world.field_shapes[g, 2]
         eu = world.field_sizes[g, 0] / mu
         ev = world.field_sizes[g, 1] / mv
-        for i in range(mu * mv):
-            if world.heights[origin + i] > -np.inf:
-                area += eu * ev
+        area += world.field_ranges[g, 2] * eu * ev
         _relative_pose(world, other, g, body, field, R, t)
-        for i in range(nu * nv):
-            z = world.heights[start + i]
-            if z == -np.inf:
-                continue
-            x = (i // nv + 0.5 - 0.5 * nu) * du
-            y = (i % nv + 0.5 - 0.5 * nv) * dv
-            p = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / eu + 0.5 * mu
-            q = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / ev + 0.5 * mv
-            if p < 0.0 or q < 0.0 or p >= mu or q >= mv:
-                continue
-            surface = world.heights[origin + int(p) * mv + int(q)]
-            if surface > -np.inf:
-                gaps[i] = min(gaps[i], abs(R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2] - surface))
-    needed = int(CONTACT_SHARE * min(own, area / (du * dv)) + 0.999)
+        low_x, high_x = _span(world, field, R, t, 0)
+        low_y, high_y = _span(world, field, R, t, 1)
+        if max(low_x, -high_x) > 0.5 * mu * eu or max(low_y, -high_y) > 0.5 * mv * ev:
+            continue
+        for i in range(nu):
+            x = (i + 0.5 - 0.5 * nu) * du
+            for j in range(nv):
+                cell = i * nv + j
+                z = heights[start + cell]
+                if z == -np.inf:
+                    continue
+                y = (j + 0.5 - 0.5 * nv) * dv
+                p = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0]) / eu + 0.5 * mu
+                q = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1]) / ev + 0.5 * mv
+                if p < 0.0 or q < 0.0 or p >= mu or q >= mv:
+                    continue
+                surface = heights[origin + int(p) * mv + int(q)]
+                if surface > -np.inf:
+                    gaps[cell] = min(gaps[cell], abs(R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2] - surface))
+    needed = int(CONTACT_SHARE * min(world.field_ranges[field, 2], area / (du * dv)) + 0.999)
     needed = min(max(needed, 1), nu * nv)
     return _smallest(gaps, needed - 1)
 
@@ -259,21 +265,29 @@ def clearance(world, a, b):
 
 
 @njit(cache=True, nogil=True)
-def on_margin(world, a, b, distance, on_distance, limit):
-    """Margin of body a resting on body b; `distance` is the signed distance of their boxes."""
-    if distance > on_distance + limit:
-        return on_distance - distance
-    gap = np.inf
-    for turn in range(2):
-        other = clearance(world, a if turn == 0 else b, b if turn == 0 else a)
-        if turn == 1:
-            # Both could be said of two thin bodies side by side: the one with the smaller gap counts.
-            return min(on_distance - gap, other - gap)
-        gap = other
-        if gap == np.inf:
-            break
-        if gap > on_distance + limit or world.supports[b, 1] > 0:
-            return on_distance - gap
+def _clearance_bound(world, a, b):
+    """Lower bound of `clearance`: how far the heights of the surfaces keep apart, wherever these overlap."""
+    lower = _facing(world, a, -1.0)
+    count = world.supports[b, 1]
+    first = world.supports[b, 0] if count > 0 else _facing(world, b, 1.0)
+    R = np.empty((3, 3))
+    t = np.empty(3)
+    bound = np.inf
+    for turn in range(1 if count > 0 else 2):
+        for g in range(first, first + max(count, 1)):
+            if turn == 0:
+                body, field, other, surface = a, lower, b, g
+            else:
+                body, field, other, surface = b, g, a, lower
+            _relative_pose(world, other, surface, body, field, R, t)
+            low, high = _span(world, field, R, t, 2)
+            bound = min(bound, max(low - world.field_ranges[surface, 1], world.field_ranges[surface, 0] - high))
+    return bound
+
+
+@njit(cache=True, nogil=True)
+def _level_margin(world, a, b, distance, on_distance):
+    """Margin of body a resting on body b, which is not below it: how far their levels and boxes are apart."""
     bottom = world.centres[a, 2]
     top = world.centres[b, 2]
     for k in range(3):
@@ -289,9 +303,33 @@ def on_margin(world, a, b, distance, on_distance, limit):
 
 
 @njit(cache=True, nogil=True)
-def pair_margins(world, a, b, distance, parameters, limit, out):
-    """Margins of all relations of a to b into `out` (11,); `distance` is the signed distance of their boxes."""
-    out[ON] = on_margin(world, a, b, distance, parameters.on_distance, limit)
+def on_margin(world, a, b, distance, on_distance, limit):
+    """Margin of body a resting on body b; `distance` is the signed distance of their boxes."""
+    beside = _level_margin(world, a, b, distance, on_distance)
+    if beside < -limit:
+        bound = _clearance_bound(world, a, b)
+        if bound > on_distance + limit:
+            return max(beside, on_distance - bound)
+    gap = clearance(world, a, b)
+    if gap == np.inf:
+        return beside
+    if gap > on_distance + limit or world.supports[b, 1] > 0:
+        return on_distance - gap
+    # Both could be said of two thin bodies side by side: the one with the smaller gap counts.
+    return min(on_distance - gap, clearance(world, b, a) - gap)
+
+
+@njit(cache=True, nogil=True)
+def pair_margins(world, a, b, distance, parameters, limit, t, e, out):
+    """Margins of all relations of a to b into `out` (11,).
+
+    `distance` is the signed distance of their boxes, `limit` the distance from a boundary beyond which a margin may be
+    a bound; `t` and `e` (3,) are scratch.
+    """
+    if distance > parameters.on_distance + limit:
+        out[ON] = parameters.on_distance - distance
+    else:
+        out[ON] = on_margin(world, a, b, distance, parameters.on_distance, limit)
     out[NEAR] = parameters.near_range - distance
     out[TOUCHING] = parameters.touch_distance - distance
     if world.layout[a] or world.layout[b]:
@@ -300,103 +338,62 @@ def pair_margins(world, a, b, distance, parameters, limit, out):
         out[INTERSECTS] = -np.inf
         return
     out[INTERSECTS] = -distance - parameters.intersection_depth
-    out[IN] = in_margin(world, a, b, parameters.strict)
-    for d in range(6):
-        axis, sign = DIRECTION_AXES[d]
-        out[ABOVE + d] = direction_margin(
-            world.centres[a],
-            world.rotations[a],
-            world.halves[a],
-            world.centres[b],
-            world.rotations[b],
-            world.halves[b],
-            axis,
-            sign,
-            parameters,
-            limit,
-        )
+    ca, Ra, ha = world.centres[a], world.rotations[a], world.halves[a]
+    cb, Rb, hb = world.centres[b], world.rotations[b], world.halves[b]
+    relative_box(ca, Ra, ha, cb, Rb, t, e)
+    out[IN] = in_margin(world.interior_centres[b], world.interior_halves[b], hb, t, e, parameters.strict)
+    _direction_margins(ca, Ra, ha, cb, Rb, hb, t, e, parameters, limit, out)
 
 
 @njit(cache=True, nogil=True)
-def box_distance(world, a, b, limit):
-    """Signed distance of the boxes of two slots, the same in either order."""
+def _direction_margins(ca, Ra, ha, cb, Rb, hb, t, e, parameters, limit, out):
+    for d in range(6):
+        axis, sign = DIRECTION_AXES[d]
+        i1 = (axis + 1) % 3
+        i2 = (axis + 2) % 3
+        aside = max(abs(t[i1]) - hb[i1] - e[i1], abs(t[i2]) - hb[i2] - e[i2])
+        if parameters.projection and aside > limit:
+            # Most pairs lie beside four of the six regions, or all of them.
+            out[ABOVE + d] = -aside
+        else:
+            out[ABOVE + d] = direction_margin(ca, Ra, ha, cb, Rb, hb, t, e, axis, sign, parameters, limit)
+
+
+@njit(cache=True, nogil=True)
+def box_distance(world, a, b, parameters, limit):
+    """Signed distance of the boxes of two slots, the same in either order.
+
+    With a finite `limit` it may be a bound that lies on the same side of every threshold, by `limit` at least.
+    """
     i, j = min(a, b), max(a, b)
-    return signed_distance(
-        world.centres[i],
-        world.rotations[i],
-        world.halves[i],
-        world.centres[j],
-        world.rotations[j],
-        world.halves[j],
-        limit,
-    )
+    ci, Ri, hi = world.centres[i], world.rotations[i], world.halves[i]
+    cj, Rj, hj = world.centres[j], world.rotations[j], world.halves[j]
+    if limit == np.inf:
+        return signed_distance(ci, Ri, hi, cj, Rj, hj, np.inf)
+    far = parameters.near_range + limit
+    gap = np.sqrt((ci[0] - cj[0]) ** 2 + (ci[1] - cj[1]) ** 2 + (ci[2] - cj[2]) ** 2)
+    gap -= world.radii[i] + world.radii[j]
+    if gap > far:
+        return gap
+    gap = separation(ci, Ri, hi, cj, Rj, hj)
+    if gap <= 0.0 or gap > far:
+        return gap
+    upper = corner_distance(ci, Ri, hi, cj, Rj, hj)
+    for threshold in (0.0, parameters.touch_distance, parameters.on_distance, parameters.near_range):
+        if gap < threshold + limit and upper > threshold - limit:
+            return distance_apart(ci, Ri, hi, cj, Rj, hj, gap, np.empty(3), np.empty(3))
+    return upper
 
 
 @njit(cache=True, nogil=True)
 def margin_table(world, pairs, parameters):
     """(P, 11) exact margins of ordered pairs of slots (P, 2), subject and reference; -inf for a slot with itself."""
     out = np.full((pairs.shape[0], COUNT), -np.inf)
+    t = np.empty(3)
+    e = np.empty(3)
     for row in range(pairs.shape[0]):
         a = pairs[row, 0]
         b = pairs[row, 1]
         if a != b:
-            pair_margins(world, a, b, box_distance(world, a, b, np.inf), parameters, np.inf, out[row])
+            pair_margins(world, a, b, box_distance(world, a, b, parameters, np.inf), parameters, np.inf, t, e, out[row])
     return out
-
-
-@njit(cache=True, nogil=True)
-def _refresh(bits, a, b, margins, parameters):
-    """New bit mask of an ordered pair, with hysteresis."""
-    old = bits[a, b]
-    new = 0
-    for r in range(COUNT):
-        held = old >> r & 1
-        if margins[r] >= (-parameters.leave_margin if held else parameters.enter_margin):
-            new |= 1 << r
-    return new
-
-
-@njit(cache=True, nogil=True)
-def update_pairs(world, slots, moved, bits, parameters):
-    """Bring `bits` (C, C) up to date for the pairs in which a slot `moved` (C,) bool takes part.
-
-    `slots` (S,) are the slots in use. Returns rows (P, 4): subject, reference, old mask, new mask of changed pairs.
-    """
-    changes = np.empty((64, 4), np.int64)
-    count = 0
-    margins = np.empty(COUNT)
-    limit = max(parameters.leave_margin, 0.0)
-    for i in slots:
-        if not moved[i]:
-            continue
-        for j in slots:
-            if i == j or (moved[j] and j < i):
-                continue
-            square = 0.0
-            for k in range(3):
-                square += (world.centres[i, k] - world.centres[j, k]) ** 2
-            span = max(world.reach[i] + world.radii[j], world.reach[j] + world.radii[i])
-            near = square <= span * span
-            if not near and bits[i, j] == 0 and bits[j, i] == 0:
-                continue
-            distance = box_distance(world, i, j, parameters.near_range + limit) if near else np.inf
-            for turn in range(2):
-                a, b = (i, j) if turn == 0 else (j, i)
-                new = 0
-                if near:
-                    pair_margins(world, a, b, distance, parameters, limit, margins)
-                    new = _refresh(bits, a, b, margins, parameters)
-                if new != bits[a, b]:
-                    if count == changes.shape[0]:
-                        longer = np.empty((2 * count, 4), np.int64)
-                        for row in range(count):
-                            for k in range(4):
-                                longer[row, k] = changes[row, k]
-                        changes = longer
-                    changes[count, 0] = a
-                    changes[count, 1] = b
-                    changes[count, 2] = bits[a, b]
-                    changes[count, 3] = new
-                    count += 1
-                    bits[a, b] = new
-    return changes[:count]

@@ -11,17 +11,17 @@ A margin is the signed distance of a pair from the boundary of a relation, in me
 docs/scene_graph.md shows every definition.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from simtrack.contracts import Float64, Room
+from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError, UnknownNameError
 from simtrack.geometry.boxes import OrientedBox
 from simtrack.perception.scene_graph import kernels
-from simtrack.perception.scene_graph.kernels import Parameters, World
-from simtrack.perception.scene_graph.shapes import HeightField, Shape
+from simtrack.perception.scene_graph.bodies import Body, BodyArrays
+from simtrack.perception.scene_graph.kernels import Parameters
 
 RELATIONS = (
     "on",
@@ -97,96 +97,6 @@ class RelationConfig:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Body:
-    """A shape at a pose."""
-
-    shape: Shape
-    T_map: Float64
-    """(4, 4), origin in the centre of the box."""
-
-    @property
-    def box(self) -> OrientedBox:
-        """The body's oriented box."""
-        return OrientedBox(self.T_map, self.shape.extents)
-
-
-class BodyArrays:
-    """Bodies in the arrays that the kernels read; rows (slots) are reused, arrays grow by doubling."""
-
-    def __init__(self, shapes: Mapping[str, Shape], config: RelationConfig, capacity: int = 16) -> None:
-        self._config = config
-        self._rows: dict[str, tuple[list[int], tuple[int, int]]] = {}
-        self.shapes: dict[str, Shape] = {}
-        self._fields: list[HeightField] = []
-        self._stale = False
-        self._free = list(range(capacity - 1, -1, -1))
-        self.alive = np.zeros(capacity, dtype=np.bool_)
-        self.world = _empty_world(capacity)
-        for name, shape in shapes.items():
-            self.declare(name, shape)
-
-    def declare(self, kind: str, shape: Shape) -> None:
-        """Make a shape known under a name."""
-        first = len(self._fields)
-        self._fields += [*shape.fields, *shape.supports]
-        self._rows[kind] = (list(range(first, first + 6)), (first + 6, len(shape.supports)))
-        self.shapes[kind] = shape
-        self._stale = True
-
-    def add(self, kind: str, T_map: Float64) -> int:
-        """Put a body of a declared shape into a free slot."""
-        self._refresh_fields()
-        if not self._free:
-            self._grow()
-        slot = self._free.pop()
-        shape, world = self.shapes[kind], self.world
-        world.halves[slot] = 0.5 * np.asarray(shape.extents)
-        world.radii[slot] = np.linalg.norm(world.halves[slot])
-        world.reach[slot] = _reach(shape, self._config)
-        world.layout[slot] = shape.layout
-        world.interior_centres[slot] = 0.0 if shape.interior is None else shape.interior.centre
-        world.interior_halves[slot] = 0.0 if shape.interior is None else 0.5 * shape.interior.extents
-        world.fields[slot], world.supports[slot] = self._rows[kind]
-        self.alive[slot] = True
-        self.set_poses(np.array([slot]), np.asarray(T_map, dtype=float)[None])
-        return slot
-
-    def set_poses(self, slots: np.ndarray, T_map: Float64) -> None:
-        """Move slots (S,) to poses (S, 4, 4)."""
-        self.world.centres[slots] = T_map[:, :3, 3]
-        self.world.rotations[slots] = T_map[:, :3, :3]
-
-    def remove(self, slot: int) -> None:
-        """Free a slot."""
-        self.alive[slot] = False
-        self._free.append(slot)
-
-    def _grow(self) -> None:
-        old, size = self.world, len(self.alive)
-        world = _empty_world(2 * size)
-        for name in _PER_SLOT:
-            getattr(world, name)[:size] = getattr(old, name)
-        self.world = world._replace(**{name: getattr(old, name) for name in World._fields if name not in _PER_SLOT})
-        self.alive = np.concatenate([self.alive, np.zeros(size, dtype=np.bool_)])
-        self._free = list(range(2 * size - 1, size - 1, -1))
-
-    def _refresh_fields(self) -> None:
-        if not self._stale:
-            return
-        sizes = [field.heights.size for field in self._fields]
-        starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-        shapes = [(*f.heights.shape, s) for f, s in zip(self._fields, starts, strict=True)]
-        self.world = self.world._replace(
-            field_rotations=np.array([f.T_entity_field[:3, :3] for f in self._fields], dtype=float),
-            field_origins=np.array([f.T_entity_field[:3, 3] for f in self._fields], dtype=float),
-            field_sizes=np.array([f.size for f in self._fields], dtype=float),
-            field_shapes=np.array(shapes, dtype=np.int32),
-            heights=np.concatenate([np.ascontiguousarray(f.heights, dtype=float).ravel() for f in self._fields]),
-        )
-        self._stale = False
-
-
 def relation_margins(
     bodies: Sequence[Body], config: RelationConfig, *, strict: bool | None = None, projection: bool | None = None
 ) -> Float64:
@@ -240,16 +150,11 @@ def relation_margin(
     axis, sign = kernels.DIRECTION_AXES[DIRECTIONS.index(name)]
     # The viewer's left and front are mirrored against a body's own: x of the box looks at the viewer, y to his right.
     sign = -sign if axis == 1 else sign
-    return float(
-        kernels.direction_margin(
-            *_parts(subject.box),
-            *_parts(seen),
-            axis,
-            sign,
-            config.parameters(strict=strict, projection=projection),
-            np.inf,
-        )
-    )
+    (ca, Ra, ha), (cb, Rb, hb) = _parts(subject.box), _parts(seen)
+    t, e = np.empty(3), np.empty(3)
+    kernels.relative_box(ca, Ra, ha, cb, Rb, t, e)
+    parameters = config.parameters(strict=strict, projection=projection)
+    return float(kernels.direction_margin(ca, Ra, ha, cb, Rb, hb, t, e, axis, sign, parameters, np.inf))
 
 
 def viewer_box(box: OrientedBox, T_map_viewer: Float64) -> OrientedBox:
@@ -268,88 +173,6 @@ def viewer_box(box: OrientedBox, T_map_viewer: Float64) -> OrientedBox:
     return OrientedBox(T, np.abs(R.T @ box.T_map_box[:3, :3]) @ np.asarray(box.extents, dtype=float))
 
 
-def room_margins(points: Float64, room: Room) -> Float64:
-    """(N,) metres from the outline of a room, >= 0 inside, of map points (N, 2) or (N, 3)."""
-    start = np.asarray(room.polygon, dtype=float)
-    end = np.roll(start, -1, axis=0)
-    p = np.asarray(points, dtype=float)[:, None, :2]
-    edge = end - start
-    share = np.clip(((p - start) * edge).sum(axis=2) / np.maximum((edge**2).sum(axis=1), 1e-18), 0.0, 1.0)
-    distance = np.linalg.norm(p - start - share[..., None] * edge, axis=2).min(axis=1)
-    straddles = (start[:, 1] > p[..., 1]) != (end[:, 1] > p[..., 1])
-    rise = np.where(edge[:, 1] == 0.0, 1.0, edge[:, 1])
-    crossing = start[:, 0] + (p[..., 1] - start[:, 1]) / rise * edge[:, 0]
-    inside = np.count_nonzero(straddles & (p[..., 0] < crossing), axis=1) % 2 == 1
-    return np.where(inside, distance, -distance)
-
-
 def _parts(box: OrientedBox) -> tuple[Float64, Float64, Float64]:
     T = np.asarray(box.T_map_box, dtype=float)
     return T[:3, 3].copy(), T[:3, :3].copy(), 0.5 * np.asarray(box.extents, dtype=float)
-
-
-def _reach(shape: Shape, config: RelationConfig) -> float:
-    """Radius about a body's centre outside of which nothing is related to it in the live variant."""
-    half = 0.5 * np.asarray(shape.extents, dtype=float)
-    reach = float(np.linalg.norm(half)) + config.near_range + config.leave_margin
-    for support in shape.supports:
-        corner = np.linalg.norm(support.T_entity_field[:3, 3]) + 0.5 * np.linalg.norm(support.size)
-        reach = max(reach, float(corner) + config.on_distance + config.leave_margin)
-    if shape.layout:
-        return reach
-    if not config.projection:
-        return np.inf
-    for axis in range(3):
-        far = half.copy()
-        far[axis] *= 1.0 + 2.0 * config.projection_factor
-        reach = max(reach, float(np.linalg.norm(far)) + config.leave_margin)
-    return reach
-
-
-_PER_SLOT = (
-    "centres",
-    "rotations",
-    "halves",
-    "interior_centres",
-    "interior_halves",
-    "layout",
-    "reach",
-    "radii",
-    "fields",
-    "supports",
-)
-
-
-def _empty_world(capacity: int) -> World:
-    return World(
-        centres=np.zeros((capacity, 3)),
-        rotations=np.zeros((capacity, 3, 3)),
-        halves=np.zeros((capacity, 3)),
-        interior_centres=np.zeros((capacity, 3)),
-        interior_halves=np.zeros((capacity, 3)),
-        layout=np.zeros(capacity, dtype=np.bool_),
-        reach=np.zeros(capacity),
-        radii=np.zeros(capacity),
-        fields=np.zeros((capacity, 6), dtype=np.int32),
-        supports=np.zeros((capacity, 2), dtype=np.int32),
-        field_rotations=np.zeros((0, 3, 3)),
-        field_origins=np.zeros((0, 3)),
-        field_sizes=np.zeros((0, 2)),
-        field_shapes=np.zeros((0, 3), dtype=np.int32),
-        heights=np.zeros(0),
-    )
-
-
-__all__ = [
-    "CONVERSE",
-    "DIRECTIONS",
-    "RELATIONS",
-    "SYMMETRIC",
-    "Body",
-    "BodyArrays",
-    "RelationConfig",
-    "relation_margin",
-    "relation_margins",
-    "room_margins",
-    "viewer_box",
-]

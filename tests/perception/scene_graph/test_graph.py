@@ -100,6 +100,37 @@ def test_only_believed_tracks_enter_and_refuted_ones_leave(graph: SceneGraph, tr
     assert graph.history("relay-1", "on", "workbench") == ((2, 3),)
 
 
+def test_what_was_in_a_container_that_left_has_another_parent(graph: SceneGraph, track: TrackMaker) -> None:
+    """A relay that leans in a tub, on nothing: once the tub is gone, it is in the room."""
+    relay = transform(exp_so3(np.array([0.9, 0.4, 0.0])), (0.1, 0.05, BENCH_TOP + 0.09))
+    tub = track("tub", 1, on_bench(TUB), 1)
+    graph.update(1, [tub, track("relay", 2, relay, 1)])
+    assert graph.entity("relay-2").parent == "tub-1"
+    graph.update(2, [track("relay", 2, relay, 2)])
+    assert graph.entity("relay-2").parent == "lab"
+    assert_history_is_sound(graph)
+
+
+def test_relations_handed_out_keep_while_the_graph_goes_on(graph: SceneGraph, track: TrackMaker) -> None:
+    before = graph.update(1, [track("relay", 1, on_bench(RELAY), 1)])
+    held = frozenset(before)
+    assert Relation("relay-1", "on", "workbench") in held
+    graph.update(2, [track("relay", 1, upright(0, 0, 1.2), 2), track("tray", 2, on_bench(TRAY, y=0.5), 2)])
+    assert before == held
+    assert len(before) == len(held)
+    assert graph.relations != before
+
+
+def test_tracks_come_back_and_come_in_any_order(graph: SceneGraph, track: TrackMaker) -> None:
+    places = {n: on_bench(RELAY, y=0.12 * n) for n in range(-4, 5)}
+    for stamp, numbers in enumerate(([0, 1, 2], [0, 1, 2], [2, 1, 0], [4, 0], [-4, 4, 0, 1], []), start=1):
+        relations = graph.update(stamp, [track("relay", n, places[n], stamp) for n in numbers])
+        on = {r.subject for r in relations if r.name == "on" and r.reference == "workbench"}
+        assert on == {f"relay-{n}" for n in numbers}
+        for n in numbers:
+            np.testing.assert_array_equal(graph.entity(f"relay-{n}").T_map, places[n])
+
+
 # ------------------------------------------------------------------------------------------------------------- carrying
 
 

@@ -20,7 +20,7 @@ from simtrack.perception.scene_graph import (
     relation_margin,
     relation_margins,
 )
-from simtrack.perception.scene_graph.relations import room_margins
+from simtrack.perception.scene_graph.rooms import RoomIndex, room_margins
 
 CONFIG = RelationConfig()
 MIRRORED = {"left-of": "right-of", "right-of": "left-of"}
@@ -264,6 +264,25 @@ def test_room_margins_agree_with_shapely(seed: int) -> None:
     expected = [shape.exterior.distance(Point(p)) * (1 if shape.contains(Point(p)) else -1) for p in points]
     if shape.is_valid:
         np.testing.assert_allclose(room_margins(points, Room("r", polygon)), expected, atol=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_points_are_in_the_room_in_which_they_lie_deepest(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-3, 2, (6, 2))
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    rooms = [Room(str(k), corner + rng.uniform(0.5, 3) * square, height=2.0) for k, corner in enumerate(corners)]
+    points, nowhere, leave = rng.uniform((-3, -3, -1), (3, 3, 3), (40, 3)), np.full(40, -1), 0.1
+    margins = np.stack([room_margins(points, room) for room in rooms], axis=1)
+    margins[(points[:, 2] < -0.5) | (points[:, 2] > 2.0)] = -np.inf
+    deepest = np.where(margins.max(axis=1) >= 0.0, margins.argmax(axis=1), -1)
+    index = RoomIndex(rooms)
+    np.testing.assert_array_equal(index.assign(points, nowhere, leave), deepest)
+    current = rng.integers(-1, 6, 40)
+    stays = (current >= 0) & (margins[np.arange(40), current] >= -leave)
+    np.testing.assert_array_equal(index.assign(points, current, leave), np.where(stays, current, deepest))
+    assert RoomIndex([]).assign(points, nowhere, leave).tolist() == nowhere.tolist()
 
 
 def test_unknown_relation_lists_the_known() -> None:
