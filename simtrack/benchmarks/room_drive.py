@@ -156,10 +156,11 @@ class AllLive:
         index = world.index
         self.scene, self.world = RayScene(), world
         numbers, panel = np.arange(len(index)), TriangleMesh(*_PANEL)
-        for number, (model, T) in enumerate(zip(index.models(numbers).tolist(), index.poses(numbers), strict=True)):
-            self.scene.add(world.meshes[model], T, instance=number)
-        for k, portal in enumerate(np.flatnonzero(~index.regions.is_open).tolist()):
-            self.scene.add(panel, index.regions.rectangle(portal), instance=len(index) + k)
+        closed = np.flatnonzero(~index.regions.is_open).tolist()
+        meshes = [world.meshes[model] for model in index.models(numbers).tolist()]
+        self.scene.add_many(meshes, index.poses(numbers), numbers.tolist())
+        panels = np.array([index.regions.rectangle(portal) for portal in closed])
+        self.scene.add_many([panel] * len(closed), panels, range(len(index), len(index) + len(closed)))
         self.scene.commit()
 
     @staticmethod

@@ -37,7 +37,11 @@ ERROR_NAMES = (
 )
 """Names of RTCError, by code."""
 
-QUERY_SYMBOLS = ("rtcIntersect8", "rtcIntersect16", "rtcOccluded8", "rtcOccluded16", "rtcPointQuery")
+KERNEL_SYMBOLS = (
+    *("rtcIntersect8", "rtcIntersect16", "rtcOccluded8", "rtcOccluded16", "rtcPointQuery"),
+    *("rtcNewGeometry", "rtcSetGeometryInstancedScene", "rtcSetGeometryTimeStepCount", "rtcSetGeometryTransform"),
+    *("rtcCommitGeometry", "rtcAttachGeometryByID", "rtcReleaseGeometry", "rtcDetachGeometry"),
+)
 """What compiled kernels call by name."""
 
 FALLBACK_VARIABLE = "SIMTRACK_RAYCAST"
@@ -127,7 +131,7 @@ def embree() -> Embree:
         ctypes.CDLL(str(tbb), mode=ctypes.RTLD_GLOBAL)
         library = ctypes.CDLL(str(library_file))
         # A compiled kernel from numba's cache that met an unregistered symbol would crash, so registering comes first.
-        for name in QUERY_SYMBOLS:
+        for name in KERNEL_SYMBOLS:
             binding.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
         return Embree(library)
     except (OSError, AttributeError) as error:

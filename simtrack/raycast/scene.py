@@ -12,12 +12,12 @@ import numpy.typing as npt
 from simtrack.contracts import Bool, Float32, Float64, Int32
 from simtrack.errors import InvalidValueError, RaycastError
 from simtrack.raycast import embree as rtc
-from simtrack.raycast import fallback, kernels
+from simtrack.raycast import fallback, instancing, kernels
 from simtrack.raycast.bundle import RayBundle
 from simtrack.raycast.hits import ClosestPoints, RayHits
 from simtrack.raycast.mesh import TriangleMesh
 
-MAX_INSTANCE = 1 << 16
+MAX_INSTANCE = 1 << 21
 """Instance ids are below this: tables are indexed by them."""
 
 
@@ -57,8 +57,8 @@ class RayScene:
         self._dirty = True
         self._top = 0
         self._closed = False
-        self._table: kernels.InstanceTable | None = None
-        self._table_stale, self._moved = True, set[int]()
+        self._keeper = instancing.TableKeeper()
+        self._table = self._keeper.update(self._instances)
         if not self.fallback:
             api = rtc.embree().api
             self._top = api.rtcNewScene(rtc.embree().device)
@@ -95,30 +95,55 @@ class RayScene:
         Raises:
             InvalidValueError: the id is taken or out of range, or the transform is not an invertible affine one.
         """
-        keys = _checked_transforms(np.eye(4) if T_map_mesh is None else T_map_mesh, "T_map_mesh")
+        with self._lock:
+            if instance is None:
+                instance = next(i for i in range(MAX_INSTANCE + 1) if i not in self._instances)
+            self.add_many([mesh], np.eye(4)[None] if T_map_mesh is None else T_map_mesh, [instance])
+        return instance
+
+    def add_many(self, meshes: Sequence[TriangleMesh], T_map_mesh: npt.ArrayLike, instances: Sequence[int]) -> None:
+        """Place several instances at once, see `add`; `T_map_mesh` (N, 4, 4). If one is refused, none is placed."""
+        if not len(instances):
+            return
+        keys = _checked_transforms(T_map_mesh, "T_map_mesh")
+        if not len(meshes) == len(keys) == len(instances):
+            shape = len(meshes), keys.shape, len(instances)
+            raise InvalidValueError("meshes, T_map_mesh, instances", shape, "as many of each")
         with self._lock:
             self._open()
-            number = (
-                next(i for i in range(MAX_INSTANCE + 1) if i not in self._instances) if instance is None else instance
-            )
-            if number in self._instances or not 0 <= number < MAX_INSTANCE:
-                raise InvalidValueError("instance", number, f"0..{MAX_INSTANCE - 1} and not one of {self.instances}")
-            entry = Instance(mesh, keys)
+            new = set(instances)
+            for number in instances:
+                if number in self._instances or not 0 <= number < MAX_INSTANCE or len(new) < len(instances):
+                    allowed = f"0..{MAX_INSTANCE - 1}, each once, and not one of {self.instances}"
+                    raise InvalidValueError("instance", number, allowed)
+            entries = [Instance(mesh, keys[k : k + 1]) for k, mesh in enumerate(meshes)]
             if not self.fallback:
-                self._attach(entry, number)
-            self._instances[number] = entry
-            self._dirty = self._table_stale = True
-        return number
+                scenes = np.array([mesh.scene_handle for mesh in meshes], np.int64)
+                numbers, geometries = np.array(instances, np.int64), np.zeros(len(entries), np.int64)
+                arguments = scenes, numbers, instancing.columns(keys), geometries
+                instancing.place(rtc.embree().device, self._top, *arguments)
+                rtc.embree().check("rtcAttachGeometryByID")
+                for entry, geometry in zip(entries, geometries.tolist(), strict=True):
+                    entry.geometry = geometry
+            self._instances.update(zip(instances, entries, strict=True))
+            self._keeper.changed(instances)
+            self._dirty = True
 
     def remove(self, instance: int) -> None:
         """Take an instance out; its id becomes free, the others keep theirs."""
+        self.remove_many([instance])
+
+    def remove_many(self, instances: Sequence[int]) -> None:
+        """Take several instances out at once, see `remove`."""
+        chosen = list(dict.fromkeys(instances))
         with self._lock:
-            entry = self._get(instance)
-            if entry.geometry:
-                rtc.embree().api.rtcDetachGeometry(self._top, instance)
+            for instance in chosen:
+                self._get(instance)
+            if not self.fallback:
+                instancing.detach(self._top, np.array(chosen, np.int64))
                 rtc.embree().check("rtcDetachGeometry")
-            del self._instances[instance]
-            self._moved.discard(instance)
+            for instance in chosen:
+                del self._instances[instance]
             self._dirty = True
 
     def set_pose(self, instance: int, T_map_mesh: npt.ArrayLike) -> None:
@@ -134,12 +159,13 @@ class RayScene:
             raise InvalidValueError("T_map_mesh", keys.shape, f"({len(instances)}, 4, 4)")
         with self._lock:
             entries = [self._get(instance) for instance in instances]
-            for k, (instance, entry) in enumerate(zip(instances, entries, strict=True)):
-                self._table_stale |= len(entry.keys) > 1
+            for k, entry in enumerate(entries):
                 entry.keys = keys[k : k + 1]
-                if entry.geometry:
-                    _write_keys(entry)
-                    self._moved.add(instance)
+            if not self.fallback:
+                geometries = np.array([entry.geometry for entry in entries], np.int64)
+                instancing.move(geometries, instancing.columns(keys))
+                rtc.embree().check("rtcSetGeometryTransform")
+            self._keeper.changed(instances)
             self._dirty = True
 
     def set_motion(self, instance: int, T_keys: npt.ArrayLike) -> None:
@@ -181,7 +207,7 @@ class RayScene:
             if not self.fallback:
                 rtc.embree().api.rtcCommitScene(self._top)
                 rtc.embree().check("rtcCommitScene")
-                self._update_table()
+                self._table = self._keeper.update(self._instances)
             self._dirty = False
 
     # ------------------------------------------------------------------------------------------------------ queries
@@ -322,7 +348,6 @@ class RayScene:
                 self._release()
             self._closed = True
             self._instances.clear()
-            self._moved.clear()
 
     def __enter__(self) -> "RayScene":
         return self
@@ -345,23 +370,13 @@ class RayScene:
             raise InvalidValueError("instance", instance, f"one of {self.instances}")
         return entry
 
-    def _attach(self, entry: Instance, number: int) -> None:
-        api = rtc.embree().api
-        entry.geometry = api.rtcNewGeometry(rtc.embree().device, rtc.RTC_GEOMETRY_TYPE_INSTANCE)
-        api.rtcSetGeometryInstancedScene(entry.geometry, entry.mesh.scene_handle)
-        _write_keys(entry)
-        api.rtcAttachGeometryByID(self._top, entry.geometry, number)
-        api.rtcReleaseGeometry(entry.geometry)  # the scene keeps it
-        rtc.embree().check("rtcAttachGeometryByID")
-
     def _set_keys(self, instance: int, keys: Float64) -> None:
         with self._lock:
             entry = self._get(instance)
-            self._table_stale |= len(entry.keys) > 1 or len(keys) > 1
             entry.keys = keys
             if entry.geometry:
                 _write_keys(entry)
-                self._moved.add(instance)
+            self._keeper.changed([instance])
             self._dirty = True
 
     def _geometry(self) -> object:
@@ -374,39 +389,6 @@ class RayScene:
             buffers[number] = entry.mesh.vertices.ctypes.data, entry.mesh.faces.ctypes.data
             poses[number] = entry.keys[0, :3]
         return closest.Geometry(buffers, poses)
-
-    def _update_table(self) -> None:
-        """Bring what kernels know of the instances up to date; most changes only move instances that are at rest."""
-        if self._table is None or self._table_stale:
-            self._table = self._instance_table()
-        elif self._moved:
-            rows = sorted(self._moved)
-            self._table.normal[rows] = _normal_matrices(np.array([self._instances[i].keys[0] for i in rows]))
-        self._table_stale = False
-        self._moved.clear()
-
-    def _instance_table(self) -> kernels.InstanceTable:
-        size = max(self._instances, default=-1) + 1
-        normal = np.zeros((size, 3, 3), np.float32)
-        start, count = np.zeros(size, np.int32), np.ones(size, np.int32)
-        keys: list[np.ndarray] = [np.zeros((0, 3, 3))]
-        rows = 0
-        if self._instances:
-            first = np.array([entry.keys[0] for entry in self._instances.values()])
-            normal[list(self._instances)] = _normal_matrices(first)
-        for number, entry in self._instances.items():
-            linear = entry.keys[:, :3, :3]
-            if len(linear) > 1:
-                start[number], count[number] = rows, len(linear)
-                keys.append(linear)
-                rows += len(linear)
-        return kernels.InstanceTable(normal, start, count, np.concatenate(keys).astype(np.float32))
-
-
-def _normal_matrices(transforms: Float64) -> Float64:
-    """(N, 3, 3) inverse transposes, scaled, of the linear parts of transforms (N, 4, 4)."""
-    matrices = np.linalg.inv(transforms[:, :3, :3]).transpose(0, 2, 1)
-    return np.asarray(matrices / np.abs(matrices).max(axis=(1, 2), keepdims=True))
 
 
 def _write_keys(entry: Instance) -> None:

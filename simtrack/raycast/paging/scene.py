@@ -340,8 +340,7 @@ class PagedScene:
     def _keep_origin_near(self, position: Float64) -> None:
         if np.abs(position - self._origin).max() > _FAR:
             self._origin = np.round(position / _ORIGIN_STEP) * _ORIGIN_STEP
-            for slot, pose in zip(self._slots.values(), self._poses(list(self._slots)), strict=True):
-                self._scene.set_pose(slot, pose)
+            self._scene.set_poses(list(self._slots.values()), self._poses(list(self._slots)))
 
     def _poses(self, owners: Sequence[int]) -> Float64:
         """(K, 4, 4) of objects and panels in the frame of the live scene."""
@@ -374,22 +373,25 @@ class PagedScene:
             raise RaycastError(f"more than {MAX_INSTANCE} instances within reach of the rays; cast less far")
         self._own_table(len(new))
         models = iter(self.index.models([owner for owner in new if owner >= 0]).tolist())
-        for owner, pose in zip(new, self._poses(new), strict=True):
-            slot = self._free.pop() if self._free else len(self._slots)
-            self._scene.add(self._panel if owner < 0 else self.meshes[next(models)], pose, instance=slot)
-            self._slots[owner], self._owners[slot] = slot, owner
+        meshes = [self._panel if owner < 0 else self.meshes[next(models)] for owner in new]
+        fresh = range(len(self._slots) + len(self._free), MAX_INSTANCE)
+        slots = [*self._free[::-1], *fresh[: len(new)]][: len(new)]
+        self._scene.add_many(meshes, self._poses(new), slots)
+        del self._free[len(self._free) - min(len(new), len(self._free)) :]
+        self._slots.update(zip(new, slots, strict=True))
+        self._owners[slots] = new
         return len(new)
 
-    def _retire(self, owners: Sequence[int]) -> int:
+    def _retire(self, owners: Iterable[int]) -> int:
         """Remove the instances of objects or panels that have one. Returns how many."""
         gone = [owner for owner in owners if owner in self._slots]
-        if gone:
-            self._own_table(0)
-        for owner in gone:
-            slot = self._slots.pop(owner)
-            self._scene.remove(slot)
-            self._owners[slot] = _FREE
-            self._free.append(slot)
+        if not gone:
+            return 0
+        self._own_table(0)
+        slots = [self._slots.pop(owner) for owner in gone]
+        self._scene.remove_many(slots)
+        self._owners[slots] = _FREE
+        self._free.extend(slots)
         return len(gone)
 
     def _own_table(self, more: int) -> None:

@@ -148,7 +148,7 @@ def test_what_was_left_behind_is_retired_after_a_while() -> None:
         assert members <= scene.live_instances <= members + len(scene.regions.sides)
 
 
-def test_ids_go_beyond_what_one_scene_holds_and_results_outlive_the_scene() -> None:
+def test_ids_are_those_of_the_index_and_results_outlive_changes() -> None:
     made = world(20_000)
     with paged(made) as scene:
         T = rooms.drive(made, 1)[0]
