@@ -164,17 +164,23 @@ def aim(
     Rows of `out` that are left over become rays without direction, which meet nothing.
     """
     to_origins, to_directions, to_ranges, to_sigmas = out
-    matrix, offset = T[:3, :3].astype(np.float32), T[:3, 3].copy()
+    m, t = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
+    m00, m01, m02, m10, m11, m12 = m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2]
+    m20, m21, m22, t0, t1, t2 = m[2, 0], m[2, 1], m[2, 2], t[0], t[1], t[2]
     count = thinned_count(ranges.shape[0], stride)
-    for j in range(count):
-        i = (j // BLOCK) * stride * BLOCK + j % BLOCK
-        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
-        u, v, w = directions[i, 0], directions[i, 1], directions[i, 2]
-        for a in range(3):
-            moved = matrix[a, 0] * x + matrix[a, 1] * y + matrix[a, 2] * z
-            to_origins[j, a] = moved + offset[a]
-            to_directions[j, a] = matrix[a, 0] * u + matrix[a, 1] * v + matrix[a, 2] * w
-        to_ranges[j], to_sigmas[j] = ranges[i], sigmas[i]
+    for first in range(0, count, BLOCK):
+        ahead = first * (stride - 1)
+        for j in range(first, min(first + BLOCK, count)):
+            i = j + ahead
+            x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
+            to_origins[j, 0] = m00 * x + m01 * y + m02 * z + t0
+            to_origins[j, 1] = m10 * x + m11 * y + m12 * z + t1
+            to_origins[j, 2] = m20 * x + m21 * y + m22 * z + t2
+            x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+            to_directions[j, 0] = m00 * x + m01 * y + m02 * z
+            to_directions[j, 1] = m10 * x + m11 * y + m12 * z
+            to_directions[j, 2] = m20 * x + m21 * y + m22 * z
+            to_ranges[j], to_sigmas[j] = ranges[i], sigmas[i]
     to_origins[count:], to_directions[count:] = 0.0, 0.0
 
 

@@ -17,7 +17,7 @@ from simtrack.geometry.transforms import difference, orthonormal
 from simtrack.perception.localization.assessment import Assessment, assess, judge
 from simtrack.perception.localization.config import RegistrationConfig
 from simtrack.perception.localization.measurement import Measurement
-from simtrack.perception.localization.surface import MapSurface
+from simtrack.perception.localization.surface import PASSED_OVER, MapSurface
 
 if TYPE_CHECKING:
     from simtrack.perception.localization.solver import Rules
@@ -85,7 +85,7 @@ def register(
     turn = 0
     while turn < len(strides):
         last = turn == len(strides) - 1
-        view = surface.cast(T, measurement, strides[turn])
+        view = surface.cast(T, measurement, strides[turn], reach=max(2.0 * PASSED_OVER, 6.0 * gate))
         pairs, count = surface.pair(T, view, gate, config.pointing_sigma)
         if count < config.min_correspondences:
             break

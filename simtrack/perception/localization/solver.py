@@ -67,9 +67,9 @@ def pair(T, view, hits, planes, map_instance, gate, pointing_sigma, patch_varian
     """
     origins, directions, ranges, sigmas = view
     distances, normals, faces, instances = hits
-    x, y, z = T[0, 3], T[1, 3], T[2, 3]
-    slack = 6.0 * gate + 0.1
-    across2 = np.float32(pointing_sigma * pointing_sigma)
+    x, y, z = np.float32(T[0, 3]), np.float32(T[1, 3]), np.float32(T[2, 3])
+    limit, slack = np.float32(gate), np.float32(6.0 * gate + 0.1)
+    across2, shared2, one = np.float32(pointing_sigma**2), np.float32(patch_variance), np.float32(1.0)
     kept = 0
     for i in range(ranges.shape[0]):
         slip = ranges[i] - distances[i]
@@ -81,7 +81,7 @@ def pair(T, view, hits, planes, map_instance, gate, pointing_sigma, patch_varian
         face = faces[i]
         n0, n1, n2 = planes[face, 0], planes[face, 1], planes[face, 2]
         cosine = n0 * d0 + n1 * d1 + n2 * d2
-        if abs(cosine * slip) > gate:
+        if abs(cosine * slip) > limit:
             continue
         r = ranges[i]
         pairs[0, kept] = (origins[i, 0] - x) + r * d0
@@ -90,17 +90,16 @@ def pair(T, view, hits, planes, map_instance, gate, pointing_sigma, patch_varian
         pairs[3, kept], pairs[4, kept], pairs[5, kept] = n0, n1, n2
         pairs[6, kept] = cosine * slip
         cosine2 = cosine * cosine
-        pairs[7, kept] = sigmas[i] * sigmas[i] * cosine2 + across2 * r * r * (np.float32(1.0) - cosine2)
+        pairs[7, kept] = sigmas[i] * sigmas[i] * cosine2 + across2 * r * r * (one - cosine2)
         patch = np.int32(planes[face, 3])
         patches[kept] = patch
         counts[patch] += 1
         kept += 1
     for i in range(kept):
-        shared = counts[patches[i]] * patch_variance
-        pairs[7, i] = 1.0 / (pairs[7, i] + shared + 1e-8)
-        pairs[8, i] = 1.0 / max(shared, 1e-12)
-    for i in range(kept):
-        counts[patches[i]] = 0
+        shared = np.float32(counts[patches[i]]) * shared2
+        pairs[7, i] = one / (pairs[7, i] + shared + np.float32(1e-8))
+        pairs[8, i] = one / max(shared, np.float32(1e-12))
+    counts[:] = 0
     return kept
 
 

@@ -102,12 +102,12 @@ class MapSurface:
         self.floor = float(np.median([room.floor for room in static_map.rooms])) if static_map.rooms else 0.0
         """m, height of the map's floor."""
 
-    def cast(self, T_map_base: Float64, shots: Measurement, stride: int = 1) -> View:
+    def cast(self, T_map_base: Float64, shots: Measurement, stride: int = 1, reach: float = 2.0 * PASSED_OVER) -> View:
         """What every `stride`-th block of shots would have met from `T_map_base`.
 
-        That is the first surface that faces the sensor, unless the shot was measured to reach through it and ends at
-        the next one: then the first is something that has been taken away since the survey. Surfaces seen from behind
-        do not count (the sensor would stand in a thing that is gone).
+        That is the first surface that faces the sensor, unless the shot was measured to reach through it, by more than
+        `reach` metres, and ends at the next one: then the first is something that has been taken away since the survey.
+        Surfaces seen from behind do not count (the sensor would stand in a thing that is gone).
         """
         from simtrack.perception.localization.kernels import aim, thinned_count, unsettled
 
@@ -120,19 +120,19 @@ class MapSurface:
         view = View(*shots_aimed, _first(room.hits, count), room.passed[:count])
         hits = view.hits
         seen = view.directions, view.ranges, hits.distances, hits.normals
-        going_on = unsettled(count, *seen, 2.0 * PASSED_OVER, MAX_BACK_FACES, room.follow, view.passed)
+        going_on = unsettled(count, *seen, reach, MAX_BACK_FACES, room.follow, view.passed)
         while going_on:
-            going_on = self._go_on(view, room, going_on)
+            going_on = self._go_on(view, room, going_on, reach)
         return view
 
-    def _go_on(self, view: View, room: _Room, count: int) -> int:
+    def _go_on(self, view: View, room: _Room, count: int, reach: float) -> int:
         """Cast the rays of `room.follow` once more; returns how many are left."""
         from simtrack.perception.localization.kernels import advance, aim_onward
 
         origins, directions = room.onward_origins[:count], room.onward_directions[:count]
         aim_onward(count, room.follow, view.origins, view.directions, origins, directions)
         onward = self.scene.cast_rays(origins, directions, out=_first(room.onward, count))
-        rules = 2.0 * PASSED_OVER, PASSED_OVER, MAX_BACK_FACES
+        rules = reach, PASSED_OVER, MAX_BACK_FACES
         met = _arrays(view.hits), _arrays(onward)
         return advance(count, view.directions, view.ranges, *met, *rules, room.follow, view.passed)
 
