@@ -1,6 +1,6 @@
 """A world of any size to cast rays at: what rays can reach is live in Embree, the rest rests in the index."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -8,19 +8,19 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from simtrack.contracts import Bool, Float32, Float64, Int32
-from simtrack.errors import InvalidValueError, RaycastError
+from simtrack.contracts import Float32, Float64, Int32
+from simtrack.errors import InvalidValueError
 from simtrack.raycast.bundle import RayBundle
 from simtrack.raycast.hits import RayHits
 from simtrack.raycast.mesh import TriangleMesh
+from simtrack.raycast.paging.live import LiveInstances, PagedHits
 from simtrack.raycast.paging.objects import EVERYWHERE, ObjectIndex
-from simtrack.raycast.scene import MAX_INSTANCE, RayScene
+from simtrack.raycast.scene import RayScene
 
 _FAR = 128.0
 """Metres from the live scene's origin at which it is moved: float32 still resolves 15 um there."""
 _ORIGIN_STEP = 64.0
 """The origin is a multiple of this, metres."""
-_FREE = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,49 +54,6 @@ class PagingReport:
     unloaded: int
     waiting: int
     """Regions ahead that the budget left for later updates."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PagedHits:
-    """What rays met, in the caller's order of rays. Valid whatever happens to the world afterwards."""
-
-    hits: RayHits
-    """As of a `RayScene`; `instances` are numbers of the live scene, which say nothing from one update to the next."""
-    owners: npt.NDArray[np.int64]
-    """(L,) object id of each live instance, or -2 - portal for the panel that closes a portal."""
-
-    @property
-    def distances(self) -> Float32:
-        """(N,), see `RayHits.distances`."""
-        return self.hits.distances
-
-    @property
-    def normals(self) -> Float32:
-        """(N, 3), see `RayHits.normals`."""
-        return self.hits.normals
-
-    @property
-    def faces(self) -> Int32:
-        """(N,), see `RayHits.faces`."""
-        return self.hits.faces
-
-    @property
-    def hit(self) -> Bool:
-        """(N,), whether the ray met anything."""
-        return self.hits.hit
-
-    @property
-    def objects(self) -> npt.NDArray[np.int64]:
-        """(N,) ids of the objects that were met, -1 for a miss or a closed portal."""
-        return np.maximum(self._owner(), -1)
-
-    @property
-    def portals(self) -> npt.NDArray[np.int64]:
-        """(N,) closed portals that were met, -1 for a miss or an object."""
-        return np.maximum(-2 - self._owner(), -1)
-
-    def _owner(self) -> npt.NDArray[np.int64]:
-        return np.where(self.hit, self.owners[self.hits.instances], _FREE)
 
 
 class PagedScene:
@@ -137,11 +94,9 @@ class PagedScene:
         self._scene = RayScene(use_fallback)
         self._origin = np.zeros(3)
         self._clock = 0
-        self._live: dict[int, int] = {}
-        self._slots: dict[int, int] = {}
-        self._free: list[int] = []
-        self._owners = np.full(256, _FREE, np.int64)
-        self._shared = False
+        self._reached: dict[int, int] = {}
+        """Live regions, and the update at which each was last within reach."""
+        self._live = LiveInstances(self._scene)
         if not self._scene.fallback:
             for mesh in (*self.meshes, self._panel):
                 _ = mesh.scene_handle  # hierarchies are built now, not when a room comes into reach
@@ -152,20 +107,20 @@ class PagedScene:
     @property
     def live_regions(self) -> Int32:
         """(K,) regions that are live, ascending."""
-        return np.array(sorted(self._live), np.int32)
+        return np.array(sorted(self._reached), np.int32)
 
     @property
     def live_instances(self) -> int:
         """Number of instances in the live scene, closed portals' panels included."""
-        return len(self._slots)
+        return len(self._live)
 
     def move(self, number: int, T_map_object: npt.ArrayLike) -> None:
         """Give an object the rigid pose (4, 4), in whatever region that is; see `ObjectIndex.move`."""
         region = self.index.move(number, T_map_object)
-        if region != EVERYWHERE and region not in self._live:
-            self._retire([number])
-        elif number in self._slots:
-            self._scene.set_pose(self._slots[number], self._poses([number])[0])
+        if region != EVERYWHERE and region not in self._reached:
+            self._live.retire([number])
+        elif number in self._live:
+            self._live.move([number], self._poses([number]))
         else:
             self._place([number])
 
@@ -173,21 +128,21 @@ class PagedScene:
         """Add an object at a rigid pose (4, 4); returns its id. See `ObjectIndex.add`."""
         number = self.index.add(model, T_map_object)
         region = self.index.region(number)
-        if region == EVERYWHERE or region in self._live:
+        if region == EVERYWHERE or region in self._reached:
             self._place([number])
         return number
 
     def remove(self, number: int) -> None:
         """Take an object out of the world."""
         self.index.remove(number)
-        self._retire([number])
+        self._live.retire([number])
 
     def set_open(self, portal: int, is_open: bool) -> None:
         """Open a portal, or close it with a panel."""
         self.regions.set_open(portal, is_open)
         if is_open:
-            self._retire([-2 - portal])
-        elif any(int(region) in self._live for region in self.regions.sides[portal]):
+            self._live.retire([-2 - portal])
+        elif any(int(region) in self._reached for region in self.regions.sides[portal]):
             self._place([-2 - portal])
 
     # ------------------------------------------------------------------------------------------------------- paging
@@ -208,15 +163,15 @@ class PagedScene:
         regions = np.concatenate([found for found, _ in ahead])
         order = np.argsort(np.concatenate([ways for _, ways in ahead]), kind="stable")
         loaded = waiting = 0
-        for region in regions[order].tolist():
-            if region in self._live:
-                self._live[region] = self._clock
+        for region in dict.fromkeys(regions[order].tolist()):
+            if region in self._reached:
+                self._reached[region] = self._clock
             elif loaded < self.config.budget:
                 loaded += self._load(region)
             else:
                 waiting += 1
         unloaded = 0
-        for region in [r for r, seen in self._live.items() if seen < self._clock - self.config.linger]:
+        for region in [r for r, seen in self._reached.items() if seen < self._clock - self.config.linger]:
             if unloaded >= self.config.budget:
                 break
             unloaded += self._unload(region)
@@ -234,8 +189,8 @@ class PagedScene:
         regions, _ = self.regions.reachable(position, reach, radius + self.index.overhang)
         loaded = 0
         for region in regions.tolist():
-            if region in self._live:
-                self._live[region] = self._clock
+            if region in self._reached:
+                self._reached[region] = self._clock
             else:
                 loaded += self._load(region)
         return loaded
@@ -270,7 +225,7 @@ class PagedScene:
         limit = self._reach_for(bundle.directions, T[:3, 3], 0.0, max_distance)
         T[:3, 3] -= self._origin
         hits = self._scene.cast(bundle, T, limit, min_distance=min_distance, out=out)
-        return self._signed(hits)
+        return self._live.signed(hits)
 
     def cast_rays(
         self,
@@ -305,7 +260,7 @@ class PagedScene:
         radius = float(np.linalg.norm(usable - middle, axis=1).max())
         limit = self._reach_for(rays, middle, radius, max_distance)
         arguments = {"min_distance": min_distance, "packing": packing, "out": out}
-        return self._signed(self._scene.cast_rays(starts - self._origin, rays, None, limit, **arguments))
+        return self._live.signed(self._scene.cast_rays(starts - self._origin, rays, None, limit, **arguments))
 
     # -------------------------------------------------------------------------------------------------- life and end
 
@@ -333,14 +288,10 @@ class PagedScene:
         self.require(position, limit * longest, radius)
         return limit
 
-    def _signed(self, hits: RayHits) -> PagedHits:
-        self._shared = True
-        return PagedHits(hits, self._owners)
-
     def _keep_origin_near(self, position: Float64) -> None:
         if np.abs(position - self._origin).max() > _FAR:
             self._origin = np.round(position / _ORIGIN_STEP) * _ORIGIN_STEP
-            self._scene.set_poses(list(self._slots.values()), self._poses(list(self._slots)))
+            self._live.move(self._live.owners, self._poses(self._live.owners))
 
     def _poses(self, owners: Sequence[int]) -> Float64:
         """(K, 4, 4) of objects and panels in the frame of the live scene."""
@@ -356,52 +307,22 @@ class PagedScene:
         portals = self.regions.portals_of(region)
         panels = -2 - portals[~self.regions.is_open[portals]]
         loaded = self._place([*self.index.members(region).tolist(), *panels.tolist()])
-        self._live[region] = self._clock
+        self._reached[region] = self._clock
         return loaded
 
     def _unload(self, region: int) -> int:
-        del self._live[region]
-        portals = self.regions.portals_of(region).tolist()
-        sides = self.regions.sides
-        panels = [-2 - p for p in portals if int(sides[p, 0]) not in self._live and int(sides[p, 1]) not in self._live]
-        return self._retire(self.index.members(region).tolist()) + self._retire(panels)
+        del self._reached[region]
+        portals = self.regions.portals_of(region)
+        unseen = [p for p in portals.tolist() if self._reached.keys().isdisjoint(self.regions.sides[p].tolist())]
+        return self._live.retire([*self.index.members(region).tolist(), *(-2 - p for p in unseen)])
 
-    def _place(self, owners: Iterable[int]) -> int:
-        """Add instances for objects, or for panels (-2 - portal); those that have one keep it. Returns how many."""
-        new = [int(owner) for owner in owners if owner not in self._slots]
-        if len(self._slots) + len(new) > MAX_INSTANCE:
-            raise RaycastError(f"more than {MAX_INSTANCE} instances within reach of the rays; cast less far")
-        self._own_table(len(new))
+    def _place(self, owners: Sequence[int]) -> int:
+        """Make objects and panels live that are not so yet; returns how many."""
+        new = [owner for owner in owners if owner not in self._live]
         models = iter(self.index.models([owner for owner in new if owner >= 0]).tolist())
         meshes = [self._panel if owner < 0 else self.meshes[next(models)] for owner in new]
-        fresh = range(len(self._slots) + len(self._free), MAX_INSTANCE)
-        slots = [*self._free[::-1], *fresh[: len(new)]][: len(new)]
-        self._scene.add_many(meshes, self._poses(new), slots)
-        del self._free[len(self._free) - min(len(new), len(self._free)) :]
-        self._slots.update(zip(new, slots, strict=True))
-        self._owners[slots] = new
+        self._live.place(new, meshes, self._poses(new))
         return len(new)
-
-    def _retire(self, owners: Iterable[int]) -> int:
-        """Remove the instances of objects or panels that have one. Returns how many."""
-        gone = [owner for owner in owners if owner in self._slots]
-        if not gone:
-            return 0
-        self._own_table(0)
-        slots = [self._slots.pop(owner) for owner in gone]
-        self._scene.remove_many(slots)
-        self._owners[slots] = _FREE
-        self._free.extend(slots)
-        return len(gone)
-
-    def _own_table(self, more: int) -> None:
-        """Make the table of owners large enough, and its own copy if results hold on to it."""
-        needed = len(self._slots) + len(self._free) + more
-        if needed > len(self._owners):
-            self._owners = np.concatenate([self._owners, np.full(needed, _FREE, np.int64)])
-        elif self._shared:
-            self._owners = self._owners.copy()
-        self._shared = False
 
 
 @njit(cache=True, nogil=True)

@@ -246,7 +246,7 @@ def test_too_many_instances_are_refused_and_nothing_is_broken(monkeypatch: pytes
     T = rooms.drive(made, 1)[0]
     T[2, 3] = 1.0
     with paged(made) as scene:
-        monkeypatch.setattr("simtrack.raycast.paging.scene.MAX_INSTANCE", 100)
+        monkeypatch.setattr("simtrack.raycast.paging.live.MAX_INSTANCE", 100)
         with pytest.raises(RaycastError, match="more than 100 instances"):
             scene.cast(LIDAR, T)
         assert 0 < scene.live_instances <= 100

@@ -35,8 +35,10 @@ class AllLive:
         index = paged.index
         self.scene, self.paged = RayScene(use_fallback), paged
         self.panel = TriangleMesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-        for number, model in enumerate(index.models(np.arange(len(index)))):
-            self.scene.add(paged.meshes[model], index.pose(number), instance=number)
+        numbers = np.arange(len(index))
+        self.scene.add_many(
+            [paged.meshes[model] for model in index.models(numbers)], index.poses(numbers), numbers.tolist()
+        )
         self.panels = len(index) + 1000
         for portal in np.flatnonzero(~index.regions.is_open).tolist():
             self.set_open(portal, False)
