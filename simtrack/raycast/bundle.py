@@ -1,7 +1,7 @@
 """Bundles of rays in a sensor's frame, packed once so that neighbouring rays are traced together."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numba as nb
@@ -11,6 +11,7 @@ import numpy.typing as npt
 from simtrack.contracts import CameraIntrinsics, Float32, Int32
 from simtrack.errors import InvalidValueError
 from simtrack.raycast import embree as rtc
+from simtrack.raycast.kernels import CHUNK, GROUP
 
 
 def packet_width() -> int:
@@ -32,6 +33,9 @@ class RayBundle:
     """(N,), flat pixel index ``row * image width + column`` of each ray, None for a bundle without an image."""
     shape: tuple[int, ...] = ()
     """Shape of the pixel grid for `from_camera`, so that ``hits.distances.reshape(bundle.shape)`` is an image."""
+    cones: Float32 = field(default_factory=lambda: np.empty((0, 6), np.float32))
+    """(G, 6) around the rays of each `kernels.GROUP` packets: axis (unit, sensor frame), and of the half opening angle
+    cosine, sine and 1 - cosine. Without them casting asks every instance."""
 
     def __len__(self) -> int:
         return len(self.directions)
@@ -84,11 +88,9 @@ class RayBundle:
         steps = [strides] * len(windows) if isinstance(strides, int) else list(strides)
         if len(steps) != len(windows) or min(steps, default=1) < 1:
             raise InvalidValueError("strides", strides, f"one number >= 1, or {len(windows)} of them")
-        mask = np.zeros((intrinsics.height, intrinsics.width), bool)
-        for window, step in zip(windows, steps, strict=True):
-            u0, v0, u1, v1 = _clip(window, intrinsics)
-            mask[-(-v0 // step) * step : v1 : step, -(-u0 // step) * step : u1 : step] = True
-        return RayBundle.from_pixels(intrinsics, np.flatnonzero(mask))
+        boxes = np.array([_clip(window, intrinsics) for window in windows], np.int64).reshape(-1, 4)
+        pixels = _union(boxes, np.array(steps, np.int64), intrinsics.width)
+        return _from_pixels(intrinsics, pixels, 1, (len(pixels),))
 
     @staticmethod
     def from_directions(directions: npt.ArrayLike, groups: npt.ArrayLike | None = None) -> "RayBundle":
@@ -96,7 +98,8 @@ class RayBundle:
 
         Args:
             directions: (N, 3), sensor frame; distances are measured in multiples of their length.
-            groups: (N,) integers, e.g. a lidar's rings: packets hold rays of one group, in order.
+            groups: (N,) integers, e.g. a lidar's rings: packets hold rays of one group, in order. Packets of rays that
+                are near in the caller's order are traced together: what a turning lidar sees at a time.
 
         Raises:
             InvalidValueError: wrong shape, or a direction that is not finite.
@@ -112,9 +115,11 @@ class RayBundle:
         for members in np.split(np.argsort(labels, kind="stable"), _group_starts(labels)):
             spare = -len(members) % width
             lanes.append(np.concatenate([members, np.repeat(members[-1:], spare)]))
-        order = np.concatenate(lanes).astype(np.int32) if len(rays) else np.empty(0, np.int32)
+        order = np.concatenate(lanes).astype(np.int32).reshape(-1, width)
+        order = order[np.argsort(order[:, 0], kind="stable")]
+        order = order[np.lexsort((labels[order[:, 0]], np.arange(len(order)) // CHUNK))].ravel()
         packed = np.ascontiguousarray(rays[order].reshape(-1, width, 3).transpose(0, 2, 1))
-        return RayBundle(rays, order, packed)
+        return RayBundle(rays, order, packed, cones=_cones(packed))
 
 
 def _group_starts(labels: np.ndarray) -> np.ndarray:
@@ -147,7 +152,90 @@ def _from_pixels(intrinsics: CameraIntrinsics, pixels: Int32, stride: int, shape
     columns, rows = _camera_tables(intrinsics, stride)
     camera = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
     directions, order, packed = _pack_pixels(pixels, intrinsics.width, columns, rows, *camera, packet_width())
-    return RayBundle(directions, order, packed, pixels, shape)
+    return RayBundle(directions, order, packed, pixels, shape, _pixel_cones(packed))
+
+
+@nb.njit(cache=True, nogil=True)
+def _union(boxes, steps, image_width):
+    """Ascending flat indices of the pixels (K, 4) boxes (u0, v0, u1, v1) hold at multiples of their (K,) steps."""
+    top, bottom, room = 1 << 30, 0, 0
+    for k in range(boxes.shape[0]):
+        top, bottom = min(top, boxes[k, 1]), max(bottom, boxes[k, 3])
+        size = (boxes[k, 2] - boxes[k, 0]) * (boxes[k, 3] - boxes[k, 1])
+        room += max(0, size)
+    seen = np.zeros(image_width, np.bool_)
+    pixels = np.empty(room, np.int32)
+    count = 0
+    for v in range(top, bottom):
+        low, high = image_width, 0
+        for k in range(boxes.shape[0]):
+            if boxes[k, 1] <= v < boxes[k, 3] and v % steps[k] == 0:
+                start = (boxes[k, 0] + steps[k] - 1) // steps[k] * steps[k]
+                low, high = min(low, start), max(high, boxes[k, 2])
+                for u in range(start, boxes[k, 2], steps[k]):
+                    seen[u] = True
+        for u in range(low, high):
+            if seen[u]:
+                pixels[count] = v * image_width + u
+                count += 1
+                seen[u] = False
+    return pixels[:count].copy()
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _cones(packed):
+    """(G, 6) float32 cones around the directions of each `GROUP` packets (see `RayBundle.cones`)."""
+    packets, _, width = packed.shape
+    out = np.empty(((packets + GROUP - 1) // GROUP, 6), np.float32)
+    for group in range(out.shape[0]):
+        first, last = group * GROUP, min((group + 1) * GROUP, packets)
+        ax, ay, az = 0.0, 0.0, 0.0
+        for p in range(first, last):
+            for k in range(width):
+                ax, ay, az = ax + packed[p, 0, k], ay + packed[p, 1, k], az + packed[p, 2, k]
+        axis = ax * ax + ay * ay + az * az
+        least = 1.0  # of the squared cosines, with the sign of the cosine
+        for p in range(first, last):
+            for k in range(width):
+                x, y, z = np.float64(packed[p, 0, k]), np.float64(packed[p, 1, k]), np.float64(packed[p, 2, k])
+                along = ax * x + ay * y + az * z
+                least = min(least, along * abs(along) / (axis * (x * x + y * y + z * z)))
+        _write_cone(out[group], ax, ay, az, least)
+    return out
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _pixel_cones(packed):
+    """As `_cones`, for directions with z = 1: around the rectangles that hold them, which takes less time."""
+    packets, _, width = packed.shape
+    out = np.empty(((packets + GROUP - 1) // GROUP, 6), np.float32)
+    for group in range(out.shape[0]):
+        low_x, low_y = np.float32(np.inf), np.float32(np.inf)
+        high_x, high_y = -low_x, -low_y
+        for p in range(group * GROUP, min((group + 1) * GROUP, packets)):
+            for k in range(width):
+                low_x, high_x = min(low_x, packed[p, 0, k]), max(high_x, packed[p, 0, k])
+                low_y, high_y = min(low_y, packed[p, 1, k]), max(high_y, packed[p, 1, k])
+        ax, ay = 0.5 * (np.float64(low_x) + high_x), 0.5 * (np.float64(low_y) + high_y)
+        axis = ax * ax + ay * ay + 1.0
+        least = 1.0
+        for x in (np.float64(low_x), np.float64(high_x)):
+            for y in (np.float64(low_y), np.float64(high_y)):
+                along = ax * x + ay * y + 1.0
+                least = min(least, along * abs(along) / (axis * (x * x + y * y + 1.0)))
+        _write_cone(out[group], ax, ay, 1.0, least)
+    return out
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _write_cone(cone, ax, ay, az, least):
+    """Cone around an axis of any length, whose least cosine times its absolute value is `least`."""
+    length = np.sqrt(ax * ax + ay * ay + az * az)
+    cosine = np.sqrt(abs(least)) if least > 0.0 else -np.sqrt(abs(least))
+    if not (length > 0.0 and cosine > -1.0):  # directions that cancel, or none
+        ax, ay, az, length, cosine = 0.0, 0.0, 1.0, 1.0, -1.0
+    cone[0], cone[1], cone[2] = ax / length, ay / length, az / length
+    cone[3], cone[4], cone[5] = cosine, np.sqrt(1.0 - cosine * cosine), 1.0 - cosine
 
 
 @nb.njit(cache=True, nogil=True)

@@ -1,15 +1,12 @@
 """Nearest surface points of posed instances, by Embree's point queries with a compiled callback."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba as nb
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
-from simtrack.contracts import Float64
+from simtrack.raycast.vector import carray, pointer
 
 _CHUNK = 256
 """Points a thread takes at a time."""
@@ -17,28 +14,6 @@ _CHUNK = 256
 _rtcPointQuery = types.ExternalFunction(
     "rtcPointQuery", types.boolean(types.intp, types.intp, types.intp, types.intp, types.intp)
 )
-
-
-class Geometry(NamedTuple):
-    """What the callback must know of the instances, indexed by instance id."""
-
-    buffers: np.ndarray
-    """(M, 2) int64, addresses of the float32 vertices and of the uint32 faces."""
-    poses: Float64
-    """(M, 3, 4), map from mesh."""
-
-
-def _pointer_from_address(typing_context: Any, address: Any) -> Any:
-    """Address as a pointer that `numba.carray` takes."""
-
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], cgutils.voidptr_t)
-
-    return types.voidptr(types.intp), generate
-
-
-_carray: Any = nb.carray  # pyright: ignore[reportPrivateImportUsage]
-_pointer: Any = intrinsic(_pointer_from_address)
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
@@ -90,7 +65,7 @@ def closest_on_triangle(p, a, b, c):
 def _corner(vertices, index, poses, instance):
     """Vertex in the map frame, as a tuple."""
     x, y, z = vertices[3 * index], vertices[3 * index + 1], vertices[3 * index + 2]
-    row = 12 * instance
+    row = 16 * instance
     return (
         poses[row] * x + poses[row + 1] * y + poses[row + 2] * z + poses[row + 3],
         poses[row + 4] * x + poses[row + 5] * y + poses[row + 6] * z + poses[row + 7],
@@ -126,18 +101,21 @@ def _nearer(arguments: Any) -> Any:
     """RTCPointQueryFunction: measure one triangle in the map frame and shrink the query if it is the nearest so far.
 
     The map frame serves rigid, scaled, sheared and mirrored instances alike. `userPtr` leads to six int64: instance and
-    face found, addresses of the buffers' table, of the poses, and of four float64 (squared distance, point).
+    face found, addresses of the buffers' table, of the poses, and of four float64 (squared distance, point), and the
+    instance that a mesh has which is queried by itself.
     """
-    words = _carray(_pointer(arguments), 5, np.int64)  # query, userPtr, primitive | geometry, context, scale
-    state = _carray(_pointer(words[1]), 5, np.int64)
-    best = _carray(_pointer(state[4]), 4, np.float64)
-    query = _carray(_pointer(words[0]), 5, np.float32)
-    instance = np.int64(_carray(_pointer(words[3]), 36, np.uint32)[32])
+    words = carray(pointer(arguments), 5, np.int64)  # query, userPtr, primitive | geometry, context, scale
+    state = carray(pointer(words[1]), 6, np.int64)
+    best = carray(pointer(state[4]), 4, np.float64)
+    query = carray(pointer(words[0]), 5, np.float32)
+    instance = np.int64(carray(pointer(words[3]), 36, np.int32)[32])
+    if instance < 0:
+        instance = state[5]
     face = words[2] & 0xFFFFFFFF
-    buffers = _carray(_pointer(state[2] + 16 * instance), 2, np.int64)
-    poses = _carray(_pointer(state[3]), 12 * (instance + 1), np.float64)
-    corners = _carray(_pointer(buffers[1] + 12 * face), 3, np.uint32)
-    vertices = _carray(_pointer(buffers[0]), 1 << 40, np.float32)  # the true length is not needed
+    buffers = carray(pointer(state[2] + 16 * instance), 2, np.int64)
+    poses = carray(pointer(state[3]), 16 * (instance + 1), np.float64)
+    corners = carray(pointer(buffers[1] + 12 * face), 3, np.uint32)
+    vertices = carray(pointer(buffers[0]), 1 << 40, np.float32)  # the true length is not needed
     a = _corner(vertices, np.int64(corners[0]), poses, instance)
     b = _corner(vertices, np.int64(corners[1]), poses, instance)
     c = _corner(vertices, np.int64(corners[2]), poses, instance)
@@ -161,22 +139,25 @@ CALLBACK: int = _callback.address
 
 
 @nb.njit(cache=True, nogil=True)
-def _chunk(chunk, scene, callback, points, limit, geometry, out):
+def _chunk(chunk, scenes, callback, points, limit, buffers, poses, out):
+    others, ground, ground_id = scenes
     found_points, distances, instances, faces = out
     # RTCPointQuery, RTCPointQueryContext (two 4x4 matrices, instance id, instance primitive, stack size), our state.
     raw = np.zeros(128, np.float32)
     aligned = raw[(-raw.ctypes.data % 64) // 4 :]
     query, context = aligned[:16], aligned[16:64]
     context_words = context.view(np.uint32)
-    state, best = np.zeros(5, np.int64), np.zeros(4, np.float64)
-    state[2], state[3], state[4] = geometry.buffers.ctypes.data, geometry.poses.ctypes.data, best.ctypes.data
+    state, best = np.zeros(6, np.int64), np.zeros(4, np.float64)
+    state[2], state[3], state[4], state[5] = buffers.ctypes.data, poses.ctypes.data, best.ctypes.data, ground_id
     for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, points.shape[0])):
         query[0], query[1], query[2], query[3], query[4] = points[i, 0], points[i, 1], points[i, 2], 0.0, limit
         best[0] = np.float64(limit) * np.float64(limit)
         state[0], state[1] = -1, -1
         context_words[32], context_words[33], context_words[34] = 0xFFFFFFFF, 0, 0
         if np.isfinite(points[i, 0] + points[i, 1] + points[i, 2]):
-            _rtcPointQuery(scene, query.ctypes.data, context.ctypes.data, callback, state.ctypes.data)
+            for scene in (others, ground):
+                if scene:
+                    _rtcPointQuery(scene, query.ctypes.data, context.ctypes.data, callback, state.ctypes.data)
         instances[i], faces[i] = state[0], state[1]
         distances[i] = np.sqrt(best[0]) if state[0] >= 0 else np.inf
         for axis in range(3):
@@ -184,14 +165,35 @@ def _chunk(chunk, scene, callback, points, limit, geometry, out):
 
 
 @nb.njit(cache=True, nogil=True)
-def closest(scene, callback, points, limit, geometry, out):
-    """Nearest points of (N, 3) float32 `points` within `limit`, on the calling thread."""
+def closest(
+    others, ground, ground_id, callback, points, limit, buffers, poses, found_points, distances, instances, faces
+):
+    """Nearest points of (N, 3) float32 `points` within `limit`, on the calling thread; see `kernels.World`.
+
+    Args:
+        others: address of the scene of instances, or 0.
+        ground: address of the scene of the mesh that stands at the identity, or 0.
+        ground_id: its instance id.
+        callback: `CALLBACK`.
+        points: the queries.
+        limit: metres.
+        buffers: (M, 2) int64 by instance id, addresses of the float32 vertices and of the uint32 faces.
+        poses: (M, 4, 4) by instance id, T_map_mesh.
+        found_points: as the following, the arrays of `ClosestPoints`.
+        distances: see there.
+        instances: see there.
+        faces: see there.
+    """
+    out = found_points, distances, instances, faces
     for chunk in range((points.shape[0] + _CHUNK - 1) // _CHUNK):
-        _chunk(chunk, scene, callback, points, limit, geometry, out)
+        _chunk(chunk, (others, ground, ground_id), callback, points, np.float32(limit), buffers, poses, out)
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
-def closest_parallel(scene, callback, points, limit, geometry, out):
+def closest_parallel(
+    others, ground, ground_id, callback, points, limit, buffers, poses, found_points, distances, instances, faces
+):
     """`closest` on numba's threads."""
+    out = found_points, distances, instances, faces
     for chunk in nb.prange((points.shape[0] + _CHUNK - 1) // _CHUNK):
-        _chunk(chunk, scene, callback, points, limit, geometry, out)
+        _chunk(chunk, (others, ground, ground_id), callback, points, np.float32(limit), buffers, poses, out)

@@ -8,6 +8,7 @@ compiled numba kernels call without the interpreter. Signatures and constants fo
 import ctypes
 import importlib.util
 import os
+import warnings
 from functools import cache
 from pathlib import Path
 
@@ -22,7 +23,7 @@ RTC_FORMAT_FLOAT3 = 0x9003
 RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR = 0x9234
 RTC_BUILD_QUALITY_HIGH = 2
 RTC_SCENE_FLAG_DYNAMIC = 1
-RTC_DEVICE_PROPERTY_NATIVE_RAY8_SUPPORTED = 33
+RTC_DEVICE_PROPERTY_VERSION = 0
 RTC_DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED = 34
 RTC_MAX_TIME_STEP_COUNT = 129
 
@@ -46,6 +47,11 @@ KERNEL_SYMBOLS = (
 
 FALLBACK_VARIABLE = "SIMTRACK_RAYCAST"
 """Environment variable: ``fallback`` forces `EmbreeScene.run` instead of instances and packets."""
+CONFIG_VARIABLE = "SIMTRACK_EMBREE_CONFIG"
+"""Environment variable, read when the device is made: settings of Embree's `rtcNewDevice`, e.g. ``isa=avx2``."""
+
+VERSIONS = (40_300, 50_000)
+"""Versions of the library (10,000 major + 100 minor + patch) whose structures the kernels know: from 4.3, below 5."""
 
 _POINTER, _UINT, _INT, _SIZE = ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_size_t
 _SIGNATURES: dict[str, tuple[object, list[object]]] = {
@@ -85,11 +91,23 @@ class Embree:
         self.api = library
         # One build thread: meshes are built once, instances in microseconds, and the tree (so the winner among equally
         # near faces) cannot depend on the number of cores.
-        self.device: int = library.rtcNewDevice(b"threads=1") or 0
-        self.check("rtcNewDevice")
-        wide = library.rtcGetDeviceProperty(self.device, RTC_DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED)
-        self.packet_width: int = 16 if wide else 8
-        """Rays in a packet of the CPU's own SIMD width: 16 with AVX-512, else 8."""
+        settings = ",".join(filter(None, ("threads=1", os.environ.get(CONFIG_VARIABLE, ""))))
+        self.device: int = library.rtcNewDevice(settings.encode()) or 0
+        self.check(f"rtcNewDevice({settings!r})")
+        version = self.property(RTC_DEVICE_PROPERTY_VERSION)
+        self.version: str = f"{version // 10_000}.{version // 100 % 100}.{version % 100}"
+        """Of the library."""
+        if not VERSIONS[0] <= version < VERSIONS[1]:
+            raise RaycastError(
+                f"Embree: the library of the embreex wheel is version {self.version}; needed is 4.3 or later, below 5,"
+                " as in the wheels of embreex 4.4"
+            )
+        self.packet_width: int = 16 if self.property(RTC_DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED) else 8
+        """Rays in a packet: 16 where the device calls that native (AVX-512, if settings do not forbid it), else 8."""
+
+    def property(self, number: int) -> int:
+        """A property of the device, by its RTCDeviceProperty."""
+        return int(self.api.rtcGetDeviceProperty(self.device, number))
 
     def check(self, call: str) -> None:
         """Raise RaycastError with the name of the device's pending error, if there is one."""
@@ -140,9 +158,16 @@ def embree() -> Embree:
 
 @cache
 def available() -> bool:
-    """Whether instances and packets can be used; otherwise rays go through `EmbreeScene.run`."""
+    """Whether instances and packets can be used; otherwise rays go through `EmbreeScene.run`, and a warning says why.
+
+    Raises:
+        RaycastError: the settings in the environment are refused; without them the device might work.
+    """
     try:
         embree()
-    except RaycastError:
+    except RaycastError as error:
+        if os.environ.get(CONFIG_VARIABLE):
+            raise
+        warnings.warn(f"{error}; rays are cast one by one, which is slower", RuntimeWarning, stacklevel=2)
         return False
     return True

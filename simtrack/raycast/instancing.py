@@ -1,20 +1,13 @@
-"""Many instances at a time: placing and moving them in compiled loops, and the table that ray kernels read.
+"""Many instances at a time: Embree's part of placing, moving and removing them, in compiled loops.
 
 Through ctypes an instance costs about as much as casting a hundred rays; a room comes into reach with dozens of them.
 """
-
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit, types
 
 from simtrack.contracts import Float32, Float64
 from simtrack.raycast import embree as rtc
-from simtrack.raycast.kernels import InstanceTable
-
-if TYPE_CHECKING:
-    from simtrack.raycast.scene import Instance
 
 _p, _u, _i = types.intp, types.uint32, types.int32
 _rtcNewGeometry = types.ExternalFunction("rtcNewGeometry", _p(_p, _i))
@@ -61,59 +54,3 @@ def detach(top, numbers):
     """Take instances out of a scene."""
     for k in range(numbers.shape[0]):
         _rtcDetachGeometry(top, np.uint32(numbers[k]))
-
-
-class TableKeeper:
-    """Keeps the kernels' table in step with the instances; what changed is written anew, no more."""
-
-    def __init__(self) -> None:
-        self._changed: set[int] = set()
-        self._table = InstanceTable(
-            np.zeros((0, 3, 3), np.float32),
-            np.zeros(0, np.int32),
-            np.zeros(0, np.int32),
-            np.zeros((0, 3, 3), np.float32),
-        )
-
-    def changed(self, numbers: Iterable[int]) -> None:
-        """Remember instances that were added or moved, or that move differently."""
-        self._changed.update(numbers)
-
-    def update(self, instances: "Mapping[int, Instance]") -> InstanceTable:
-        """The table of the instances as they are now."""
-        rows = sorted(number for number in self._changed if number in instances)
-        self._changed.clear()
-        if not rows:
-            return self._table
-        self._grow(rows[-1] + 1)
-        table, entries = self._table, [instances[number] for number in rows]
-        table.normal[rows] = _normal_matrices(np.array([entry.keys[0] for entry in entries]))
-        if (table.key_count[rows] > 1).any() or any(len(entry.keys) > 1 for entry in entries):
-            self._write_motion(instances)
-        return self._table
-
-    def _grow(self, size: int) -> None:
-        old = len(self._table.normal)
-        if size <= old:
-            return
-        more = max(size, 2 * old) - old
-        normal = np.concatenate([self._table.normal, np.zeros((more, 3, 3), np.float32)])
-        start = np.concatenate([self._table.key_start, np.zeros(more, np.int32)])
-        count = np.concatenate([self._table.key_count, np.ones(more, np.int32)])
-        self._table = InstanceTable(normal, start, count, self._table.keys)
-
-    def _write_motion(self, instances: "Mapping[int, Instance]") -> None:
-        self._table.key_start[:], self._table.key_count[:] = 0, 1
-        keys, rows = [np.zeros((0, 3, 3))], 0
-        for number in sorted(number for number, entry in instances.items() if len(entry.keys) > 1):
-            linear = instances[number].keys[:, :3, :3]
-            self._table.key_start[number], self._table.key_count[number] = rows, len(linear)
-            keys.append(linear)
-            rows += len(linear)
-        self._table = self._table._replace(keys=np.concatenate(keys).astype(np.float32))
-
-
-def _normal_matrices(transforms: Float64) -> Float64:
-    """(N, 3, 3) inverse transposes, scaled, of the linear parts of transforms (N, 4, 4)."""
-    matrices = np.linalg.inv(transforms[:, :3, :3]).transpose(0, 2, 1)
-    return np.asarray(matrices / np.abs(matrices).max(axis=(1, 2), keepdims=True))

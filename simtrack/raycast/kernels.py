@@ -1,8 +1,13 @@
-"""Compiled loops that fill Embree's ray packets, trace them and read them back, without the interpreter or its lock.
+"""Compiled loops over ray packets (see `simtrack.raycast.packets`), without the interpreter or its lock.
 
-Layout of RTCRayHitW for W rays, in units of W 4-byte words: origin xyz 0-2, tnear 3, direction xyz 4-6, time 7, tfar 8,
-mask 9, id 10, flags 11 | normal xyz 12-14, u 15, v 16, primitive 17, geometry 18, instance 19, instance primitive 20.
 Every output element is written from one packet only, so the results do not depend on the number of threads.
+
+A scene is two hierarchies (see `World`): the ground, traced directly, and the other instances. Groups of packets whose
+cone meets no other instance's sphere trace the ground alone, and packets keep together only where that pays: rays that
+meet a triangle each are traced faster one by one.
+
+What Python calls takes plain arrays and numbers, because numba takes named tuples apart slowly, and hands them to the
+chunks as plain tuples, because parallel loops do not know the names.
 """
 
 from threading import Lock
@@ -10,49 +15,57 @@ from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
-from numba import types
 
-_CHUNK = 64
+from simtrack.raycast import packets
+from simtrack.raycast.vector import fill_float, rotate
+
+GROUP = 8
+"""Packets of a bundle that share a cone."""
+CHUNK = 8 * GROUP
 """Packets a thread takes at a time."""
-_COHERENT = np.uint32(1 << 16)
-"""RTC_RAY_QUERY_FLAG_COHERENT."""
+_FACES_PER_RAY = 0.3
+"""Rays are traced one by one where an instance has more faces than this for each ray that its bounding sphere takes.
+
+Measured: packets and single rays are equally fast with 0.4 visible triangles a ray, packets twice as slow with 2.
+"""
+SMALL = 4096
+"""So few rays are faster cast by the calling thread alone."""
 _POOL_LOCK = Lock()
 
-# numba does not cache kernels that hold an address; a symbol's name is cached, and `embree.embree` registers it.
-_QUERY = types.void(types.intp, types.intp, types.intp, types.intp)
-_rtcIntersect8 = types.ExternalFunction("rtcIntersect8", _QUERY)
-_rtcIntersect16 = types.ExternalFunction("rtcIntersect16", _QUERY)
-_rtcOccluded8 = types.ExternalFunction("rtcOccluded8", _QUERY)
-_rtcOccluded16 = types.ExternalFunction("rtcOccluded16", _QUERY)
+_OTHERS, _GROUND, _OTHERS_COHERENT, _GROUND_COHERENT = 1, 2, 4, 8
 
 
-class InstanceTable(NamedTuple):
-    """What kernels must know of the instances, indexed by instance id."""
+class World(NamedTuple):
+    """What kernels must know of a scene; see `simtrack.raycast.table.InstanceTable` for the arrays."""
 
-    normal: np.ndarray
-    """(M, 3, 3) float32, takes normals from the mesh to the map frame (inverse transpose, any positive scale)."""
-    key_start: np.ndarray
-    """(M,) int32, first row in `keys`."""
-    key_count: np.ndarray
-    """(M,) int32, 1 for an instance at rest."""
+    others: int
+    """Address of the RTCScene of all instances but the ground, 0 if there are none."""
+    ground: int
+    """Address of the ground's own RTCScene, 0 without a ground."""
+    ground_id: int
+    """Instance id of the ground, which stands at the identity."""
+    listed: np.ndarray
+    """(L,) int32, ids of the other instances, or empty: there may be any number, anywhere."""
+    rows: np.ndarray
+    """(M, 14) float32, by instance id: normal matrix, bounding sphere, faces."""
+    motion: np.ndarray
+    """(M, 2) int32, by instance id: first row in `keys`, number of keys (1 at rest)."""
     keys: np.ndarray
     """(K, 3, 3) float32, linear parts of the motion keys."""
 
 
 class Bundle(NamedTuple):
-    """Rays from one origin; the fields are arguments of `cast`."""
+    """Rays from one origin; see `simtrack.raycast.bundle.RayBundle`."""
 
     packed: np.ndarray
     """(B, 3, W) float32, sensor frame."""
     order: np.ndarray
     """(B * W,) int32."""
-    rotation: np.ndarray
-    """(3, 3) float32, map from sensor."""
-    origin: np.ndarray
-    """(3,) float32, map frame."""
+    cones: np.ndarray
+    """(B / GROUP, 6) float32, sensor frame: axis, and of the half opening angle cosine, sine and 1 - cosine."""
+    pose: np.ndarray
+    """(3, 4) float32, map from sensor."""
     time: np.float32
-    coherent: bool
-    """Whether the rays of a packet meet the same parts of the scene."""
 
 
 class Rays(NamedTuple):
@@ -68,19 +81,6 @@ class Rays(NamedTuple):
     """(B * W,) int32."""
 
 
-class Output(NamedTuple):
-    """The arrays of `RayHits`."""
-
-    distances: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    instances: np.ndarray
-
-
-SMALL = 4096
-"""So few rays are faster cast by the calling thread alone."""
-
-
 def run(count: int, serial: Any, parallel: Any, *arguments: Any) -> None:
     """Call a kernel for `count` rays with `numba.get_num_threads()` threads, which one caller at a time may use."""
     if count <= SMALL or nb.get_num_threads() == 1:
@@ -90,161 +90,156 @@ def run(count: int, serial: Any, parallel: Any, *arguments: Any) -> None:
         parallel(*arguments)
 
 
-@nb.njit(cache=True, nogil=True)
-def _normal_matrix(linear):
-    """Cofactor matrix of a (3, 3) with the sign of the determinant: the inverse transpose up to a positive scale."""
-    out = np.empty((3, 3), np.float32)
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        for j in range(3):
-            c, d = (j + 1) % 3, (j + 2) % 3
-            out[i, j] = linear[a, c] * linear[b, d] - linear[a, d] * linear[b, c]
-    determinant = linear[0, 0] * out[0, 0] + linear[0, 1] * out[0, 1] + linear[0, 2] * out[0, 2]
-    return -out if determinant < 0 else out
-
-
-@nb.njit(cache=True, nogil=True)
-def _moving_normal_matrix(table, instance, time):
-    """Normal matrix between two motion keys, which Embree interpolates linearly."""
-    segments = table.key_count[instance] - 1
-    position = min(max(time, np.float32(0.0)), np.float32(1.0)) * segments
-    segment = min(int(position), segments - 1)
-    fraction = np.float32(position - segment)
-    row = table.key_start[instance] + segment
-    return _normal_matrix((np.float32(1) - fraction) * table.keys[row] + fraction * table.keys[row + 1])
-
-
-@nb.njit(cache=True, nogil=True)
-def _aligned(words):
-    """At least `words` zeroed float32 from a multiple of 64 bytes on."""
-    raw = np.zeros(words + 16, np.float32)
-    return raw[(-raw.ctypes.data % 64) // 4 :]
-
-
-@nb.njit(cache=True, nogil=True)
-def _new_packet(lanes, near, time, coherent):
-    """Packet with its constant fields set, lane mask, and query arguments (flags, feature mask, null pointers).
-
-    `lanes` is a tuple as long as the packet is wide: the type fixes its length, so that loops over lanes unroll.
-    """
-    packet = _aligned(21 * len(lanes))
-    integers = packet.view(np.int32)
-    for k in range(len(lanes)):
-        packet[3 * len(lanes) + k] = near
-        packet[7 * len(lanes) + k] = time
-        integers[9 * len(lanes) + k] = -1
-        integers[10 * len(lanes) + k] = k
-    valid = _aligned(len(lanes)).view(np.int32)
-    valid[: len(lanes)] = -1
-    query = np.zeros(16, np.uint32)
-    query[0] = _COHERENT if coherent else np.uint32(0)
-    query[1] = np.uint32(0xFFFFFFFF)
-    return packet, integers, valid, query
-
-
-@nb.njit(cache=True, nogil=True)
-def _occlude(lanes, valid, scene, packet, query):
-    if len(lanes) == 16:
-        _rtcOccluded16(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
-    else:
-        _rtcOccluded8(valid.ctypes.data, scene, packet.ctypes.data, query.ctypes.data)
+# ----------------------------------------------------------------------------------------------- rays from one origin
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _turn_mixed(lanes, packet, integers, table):
-    """Normals of a packet whose lanes met different instances, moving ones or nothing, in place."""
-    width = len(lanes)
-    for k in range(width):
-        instance = integers[19 * width + k]
-        if instance < 0:
-            packet[8 * width + k] = np.inf
-            integers[17 * width + k] = -1
-            for axis in range(3):
-                packet[(12 + axis) * width + k] = 0.0
+def _discs(world, pose):
+    """(L + 1, 6) float32, sensor frame: spheres of the listed instances, then of the ground, as the sensor sees them.
+
+    Direction, cosine and sine of the angular radius, and faces by 1 - cosine; cosine -1 and no faces where the sphere
+    holds the sensor (packets keep together among walls), or where the pose is no rigid motion.
+    """
+    count = world.listed.shape[0]
+    out = np.zeros((count + 1, 6), np.float32)
+    out[:, 3] = -1.0
+    for a in range(3):
+        for b in range(3):
+            product = pose[0, a] * pose[0, b] + pose[1, a] * pose[1, b] + pose[2, a] * pose[2, b]
+            if abs(product - (1.0 if a == b else 0.0)) > 1e-5:
+                return out
+    for j in range(count + 1):
+        if j == count and world.ground == 0:
+            break
+        row = world.rows[world.listed[j] if j < count else world.ground_id]
+        offset = row[9:12] - pose[:, 3]
+        square = offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]
+        rounding = np.abs(row[9:12]).sum() + np.abs(pose[:, 3]).sum() + row[12]
+        radius = row[12] + np.float32(2e-6) * rounding
+        if not square > radius * radius:
             continue
-        m = table.normal[instance]
-        if table.key_count[instance] > 1:
-            m = _moving_normal_matrix(table, instance, packet[7 * width + k])
-        a, b, c = packet[12 * width + k], packet[13 * width + k], packet[14 * width + k]
-        x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c
-        y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c
-        z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
-        scale = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
-        packet[12 * width + k] = x * scale
-        packet[13 * width + k] = y * scale
-        packet[14 * width + k] = z * scale
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _read(lanes, packet, integers, order, base, table, turn, resting, distances, normals, faces, instances):
-    """Copy the hits of one packet to the outputs, normals turned into the map frame.
-
-    Inlined and on plain arrays: array arguments of a call, and fields of a tuple, are reference-counted each time.
-    """
-    width = len(lanes)
-    first = integers[19 * width]
-    uniform = first >= 0 and resting[first] == 1
-    for k in range(width):
-        uniform &= integers[19 * width + k] == first
-    if uniform:  # nearly always, and then one vector loop does
-        xx, xy, xz = turn[first, 0, 0], turn[first, 0, 1], turn[first, 0, 2]
-        yx, yy, yz = turn[first, 1, 0], turn[first, 1, 1], turn[first, 1, 2]
-        zx, zy, zz = turn[first, 2, 0], turn[first, 2, 1], turn[first, 2, 2]
-        for k in range(width):
-            a, b, c = packet[12 * width + k], packet[13 * width + k], packet[14 * width + k]
-            x = xx * a + xy * b + xz * c
-            y = yx * a + yy * b + yz * c
-            z = zx * a + zy * b + zz * c
-            scale = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
-            packet[12 * width + k] = x * scale
-            packet[13 * width + k] = y * scale
-            packet[14 * width + k] = z * scale
-    else:
-        _turn_mixed(lanes, packet, integers, table)
-    for k in range(width):
-        ray = np.uint32(order[base + k])
-        distances[ray] = packet[8 * width + k]
-        faces[ray] = integers[17 * width + k]
-        instances[ray] = integers[19 * width + k]
-        normals[ray, 0] = packet[12 * width + k]
-        normals[ray, 1] = packet[13 * width + k]
-        normals[ray, 2] = packet[14 * width + k]
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _bundle_chunk(chunk, lanes, scene, bundle, near, far, table, out):
-    width = len(lanes)
-    packet, integers, valid, query = _new_packet(lanes, near, bundle.time, bundle.coherent)
-    # Addresses as numbers; the arrays live until the end of the function because the loop uses them.
-    p_valid, p_packet, p_query = valid.ctypes.data, packet.ctypes.data, query.ctypes.data
-    packed, order, rotation = bundle.packed, bundle.order, bundle.rotation
-    turn, resting = table.normal, table.key_count
-    distances, normals, faces, instances = out
-    for axis in range(3):
-        for k in range(width):
-            packet[axis * width + k] = bundle.origin[axis]
-    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, packed.shape[0])):
+        distance = np.sqrt(square)
         for axis in range(3):
-            r0, r1, r2 = rotation[axis, 0], rotation[axis, 1], rotation[axis, 2]
-            for k in range(width):
-                packet[(4 + axis) * width + k] = (
-                    r0 * packed[block, 0, k] + r1 * packed[block, 1, k] + r2 * packed[block, 2, k]
-                )
-        for k in range(width):
-            packet[8 * width + k] = far
-            integers[18 * width + k] = -1
-            integers[19 * width + k] = -1
-        if width == 16:
-            _rtcIntersect16(p_valid, scene, p_packet, p_query)
-        else:
-            _rtcIntersect8(p_valid, scene, p_packet, p_query)
-        base = block * width
-        _read(lanes, packet, integers, order, base, table, turn, resting, distances, normals, faces, instances)
-    return valid[0] + np.int32(query[0])  # keeps both alive
+            turned = pose[0, axis] * offset[0] + pose[1, axis] * offset[1] + pose[2, axis] * offset[2]
+            out[j, axis] = turned / distance
+        sine = radius / distance
+        cosine = np.sqrt(np.float32(1.0) - sine * sine)
+        out[j, 3], out[j, 4] = cosine, sine
+        out[j, 5] = row[13] * (np.float32(1.0) + cosine) / (sine * sine)
+    return out
 
 
 @nb.njit(cache=True, nogil=True)
-def _load(lanes, packet, integers, valid, rays, base, far):
+def _meets(cone, disc):
+    """Whether a cone of rays may meet a sphere; margins cover the rounding."""
+    if cone[3] <= -disc[3] + np.float32(2e-6):
+        return True
+    cosine = cone[0] * disc[0] + cone[1] * disc[1] + cone[2] * disc[2]
+    return cosine >= cone[3] * disc[3] - cone[4] * disc[4] - np.float32(2e-6)
+
+
+@nb.njit(cache=True, nogil=True)
+def _to_trace(world, cones, group, discs, rays):
+    """Which hierarchies the packets of a group have to be traced in, and how: flags. `rays` is their number."""
+    flags = 0
+    last = discs.shape[0] - 1
+    if cones.shape[0] == 0:
+        flags = _OTHERS_COHERENT | _GROUND_COHERENT
+        return flags | (_OTHERS if world.others else 0) | (_GROUND if world.ground else 0)
+    cone = cones[group]
+    limit = np.float32(_FACES_PER_RAY) * np.float32(rays)
+    if world.others and last == 0:
+        flags = _OTHERS | _OTHERS_COHERENT
+    for j in range(last):
+        if _meets(cone, discs[j]):
+            flags |= _OTHERS
+            if discs[j, 5] * cone[5] <= limit:
+                flags |= _OTHERS_COHERENT
+    if world.ground and _meets(cone, discs[last]):
+        flags |= _GROUND
+        if discs[last, 5] * cone[5] <= limit:
+            flags |= _GROUND_COHERENT
+    return flags
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _bundle_chunk(chunk, lanes, world_fields, bundle_fields, discs, near, far, together, out):
+    width, world, bundle = len(lanes), World(*world_fields), Bundle(*bundle_fields)
+    packet, integers, valid = packets.new_packet(lanes, near, bundle.time)
+    arguments = packets.arguments()
+    others, ground, ground_id, _, rows, motion, keys = world_fields
+    # Addresses as numbers; the arrays live until the end of the function because it returns something of them.
+    p_valid, p_packet, p_together = packets.address(valid), packets.address(packet), packets.address(arguments)
+    p_alone, p_pose = p_together + 64, packets.address(bundle.pose)
+    p_packed, p_order = packets.address(bundle.packed), packets.address(bundle.order)
+    p_rows, p_motion = packets.address(rows), packets.address(motion)
+    p_distances, p_normals, p_faces, p_instances = out
+    blocks, cones = bundle.packed.shape[0], bundle.cones
+    for axis in range(3):
+        fill_float(lanes, p_packet + 4 * axis * width, bundle.pose[axis, 3])
+    for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, blocks), GROUP):
+        flags = _to_trace(world, cones, first // GROUP, discs, GROUP * width)
+        if together >= 0:
+            flags = flags & (_OTHERS | _GROUND) | (together * (_OTHERS_COHERENT | _GROUND_COHERENT))
+        for block in range(first, min(first + GROUP, blocks)):
+            rays = p_order + 4 * block * width
+            packets.announce(lanes, block, rays, p_distances, p_normals, p_faces, p_instances)
+            packets.reset(lanes, p_packet, far)
+            rotate(lanes, p_pose, p_packed + 12 * block * width, p_packet + 16 * width)
+            if flags & _OTHERS:
+                packets.intersect(lanes, p_valid, others, p_packet, p_together if flags & _OTHERS_COHERENT else p_alone)
+            if flags & _GROUND:
+                packets.intersect(lanes, p_valid, ground, p_packet, p_together if flags & _GROUND_COHERENT else p_alone)
+            if not packets.turn_alike(lanes, p_packet, ground_id, p_rows, p_motion):
+                packets.turn_mixed(lanes, packet, integers, ground_id, rows, motion, keys)
+            packets.write(lanes, p_packet, rays, p_distances, p_normals, p_faces, p_instances)
+    return valid[0] + np.int32(arguments[0, 0])
+
+
+@nb.njit(cache=True, nogil=True)
+def _addresses(distances, normals, faces, instances):
+    """Addresses of the output arrays, which the caller's caller holds."""
+    return packets.address(distances), packets.address(normals), packets.address(faces), packets.address(instances)
+
+
+@nb.njit(cache=True, nogil=True)
+def _chunks(order, lanes):
+    return (order.shape[0] // len(lanes) + CHUNK - 1) // CHUNK
+
+
+@nb.njit(cache=True, nogil=True)
+def cast_bundle(
+    lanes, others, ground, ground_id, listed, rows, motion, keys,
+    packed, order, cones, T_map_sensor, time, near, far, together, distances, normals, faces, instances,
+):  # fmt: skip
+    """Nearest hits of a bundle, on the calling thread; `together` is 1 or 0 for `coherent`, -1 to decide by group."""
+    world = others, ground, ground_id, listed, rows, motion, keys
+    pose = T_map_sensor[:3].astype(np.float32)
+    bundle, out = (packed, order, cones, pose, np.float32(time)), _addresses(distances, normals, faces, instances)
+    discs = _discs(World(*world), pose)
+    for chunk in range(_chunks(order, lanes)):
+        _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, out)
+
+
+@nb.njit(cache=True, nogil=True, parallel=True)
+def cast_bundle_parallel(
+    lanes, others, ground, ground_id, listed, rows, motion, keys,
+    packed, order, cones, T_map_sensor, time, near, far, together, distances, normals, faces, instances,
+):  # fmt: skip
+    """`cast_bundle` on numba's threads."""
+    world = others, ground, ground_id, listed, rows, motion, keys
+    pose = T_map_sensor[:3].astype(np.float32)
+    bundle, out = (packed, order, cones, pose, np.float32(time)), _addresses(distances, normals, faces, instances)
+    discs = _discs(World(*world), pose)
+    for chunk in nb.prange(_chunks(order, lanes)):
+        _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, out)
+
+
+# --------------------------------------------------------------------------------------------- rays of their own origin
+
+
+@nb.njit(cache=True, nogil=True)
+def _load(lanes, packet, integers, valid, rays, base):
     """Fill one packet with rays of their own origin and time; a ray that is not finite or has no direction is off."""
     for k in range(len(lanes)):
         ray = rays.order[base + k]
@@ -258,75 +253,94 @@ def _load(lanes, packet, integers, valid, rays, base, far):
         if rays.times.shape[0] > 0:
             packet[7 * len(lanes) + k] = rays.times[ray]
             poison += np.float32(0.0) * rays.times[ray]
-        packet[8 * len(lanes) + k] = far
-        integers[18 * len(lanes) + k] = -1
-        integers[19 * len(lanes) + k] = -1
         valid[k] = -1 if poison == 0.0 and length > 0.0 else 0
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _rays_chunk(chunk, lanes, scene, rays, near, far, coherent, table, out):
-    width = len(lanes)
-    packet, integers, valid, query = _new_packet(lanes, near, np.float32(0.0), coherent)
-    p_valid, p_packet, p_query = valid.ctypes.data, packet.ctypes.data, query.ctypes.data
-    order, turn, resting = rays.order, table.normal, table.key_count
-    distances, normals, faces, instances = out
-    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, order.shape[0] // width)):
+def _rays_chunk(chunk, lanes, world, ray_fields, near, far, coherent, out):
+    width, rays = len(lanes), Rays(*ray_fields)
+    packet, integers, valid = packets.new_packet(lanes, near, np.float32(0.0))
+    arguments = packets.arguments()
+    p_valid, p_packet, p_arguments = (
+        packets.address(valid),
+        packets.address(packet),
+        packets.address(arguments) + (0 if coherent else 64),
+    )
+    others, ground, ground_id, _, rows, motion, keys = world
+    p_rows, p_motion, p_order = packets.address(rows), packets.address(motion), packets.address(rays.order)
+    p_distances, p_normals, p_faces, p_instances = out
+    for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, rays.order.shape[0] // width)):
         base = block * width
-        _load(lanes, packet, integers, valid, rays, base, far)
-        if width == 16:
-            _rtcIntersect16(p_valid, scene, p_packet, p_query)
-        else:
-            _rtcIntersect8(p_valid, scene, p_packet, p_query)
-        _read(lanes, packet, integers, order, base, table, turn, resting, distances, normals, faces, instances)
-    return valid[0] + np.int32(query[0])  # keeps both alive
+        packets.reset(lanes, p_packet, far)
+        _load(lanes, packet, integers, valid, rays, base)
+        if others:
+            packets.intersect(lanes, p_valid, others, p_packet, p_arguments)
+        if ground:
+            packets.intersect(lanes, p_valid, ground, p_packet, p_arguments)
+        if not packets.turn_alike(lanes, p_packet, ground_id, p_rows, p_motion):
+            packets.turn_mixed(lanes, packet, integers, ground_id, rows, motion, keys)
+        packets.write(lanes, p_packet, p_order + 4 * base, p_distances, p_normals, p_faces, p_instances)
+    return valid[0] + np.int32(arguments[0, 0])
 
 
 @nb.njit(cache=True, nogil=True)
-def _occluded_chunk(chunk, lanes, scene, rays, near, distances, blocked):
-    packet, integers, valid, query = _new_packet(lanes, near, np.float32(0.0), False)
-    for block in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, rays.order.shape[0] // len(lanes))):
+def cast_rays(
+    lanes, others, ground, ground_id, listed, rows, motion, keys,
+    origins, directions, times, order, near, far, coherent, distances, normals, faces, instances,
+):  # fmt: skip
+    """Nearest hits of single rays, on the calling thread."""
+    world = others, ground, ground_id, listed, rows, motion, keys
+    rays, out = (origins, directions, times, order), _addresses(distances, normals, faces, instances)
+    for chunk in range(_chunks(order, lanes)):
+        _rays_chunk(chunk, lanes, world, rays, np.float32(near), np.float32(far), coherent, out)
+
+
+@nb.njit(cache=True, nogil=True, parallel=True)
+def cast_rays_parallel(
+    lanes, others, ground, ground_id, listed, rows, motion, keys,
+    origins, directions, times, order, near, far, coherent, distances, normals, faces, instances,
+):  # fmt: skip
+    """`cast_rays` on numba's threads."""
+    world = others, ground, ground_id, listed, rows, motion, keys
+    rays, out = (origins, directions, times, order), _addresses(distances, normals, faces, instances)
+    for chunk in nb.prange(_chunks(order, lanes)):
+        _rays_chunk(chunk, lanes, world, rays, np.float32(near), np.float32(far), coherent, out)
+
+
+@nb.njit(cache=True, nogil=True)
+def _occluded_chunk(chunk, lanes, others, ground, ray_fields, near, limits, blocked):
+    rays = Rays(*ray_fields)
+    packet, integers, valid = packets.new_packet(lanes, near, np.float32(0.0))
+    arguments = packets.arguments()
+    p_valid, p_packet, p_arguments = packets.address(valid), packets.address(packet), packets.address(arguments) + 64
+    for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, rays.order.shape[0] // len(lanes))):
         base = block * len(lanes)
-        _load(lanes, packet, integers, valid, rays, base, np.float32(0.0))
+        _load(lanes, packet, integers, valid, rays, base)
         for k in range(len(lanes)):
-            packet[8 * len(lanes) + k] = distances[rays.order[base + k]]
-            if not distances[rays.order[base + k]] > near:
+            limit = limits[rays.order[base + k]]
+            packet[8 * len(lanes) + k] = limit
+            if not limit > near:
                 valid[k] = 0
-        _occlude(lanes, valid, scene, packet, query)
+        if others:
+            packets.occlude(lanes, p_valid, others, p_packet, p_arguments)
+        if ground:
+            packets.occlude(lanes, p_valid, ground, p_packet, p_arguments)
         for k in range(len(lanes)):
             blocked[rays.order[base + k]] = valid[k] != 0 and packet[8 * len(lanes) + k] < 0.0
+    return valid[0] + np.int32(arguments[0, 0])
 
 
 @nb.njit(cache=True, nogil=True)
-def cast_bundle(lanes, scene, bundle, near, far, table, out):
-    """Nearest hits of a bundle, on the calling thread."""
-    for chunk in range((bundle.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
-        _bundle_chunk(chunk, lanes, scene, bundle, near, far, table, out)
+def occluded(lanes, others, ground, origins, directions, times, order, near, limits, blocked):
+    """Whether anything is nearer than `limits`, on the calling thread."""
+    rays = origins, directions, times, order
+    for chunk in range(_chunks(order, lanes)):
+        _occluded_chunk(chunk, lanes, others, ground, rays, np.float32(near), limits, blocked)
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
-def cast_bundle_parallel(lanes, scene, bundle, near, far, table, out):
-    """`cast_bundle` on numba's threads."""
-    for chunk in nb.prange((bundle.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
-        _bundle_chunk(chunk, lanes, scene, bundle, near, far, table, out)
-
-
-@nb.njit(cache=True, nogil=True)
-def cast_rays(lanes, scene, rays, near, far, coherent, table, out):
-    """Nearest hits of single rays, on the calling thread."""
-    for chunk in range((rays.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
-        _rays_chunk(chunk, lanes, scene, rays, near, far, coherent, table, out)
-
-
-@nb.njit(cache=True, nogil=True, parallel=True)
-def cast_rays_parallel(lanes, scene, rays, near, far, coherent, table, out):
-    """`cast_rays` on numba's threads."""
-    for chunk in nb.prange((rays.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
-        _rays_chunk(chunk, lanes, scene, rays, near, far, coherent, table, out)
-
-
-@nb.njit(cache=True, nogil=True)
-def occluded(lanes, scene, rays, near, distances, blocked):
-    """Whether anything is nearer than `distances`, on the calling thread."""
-    for chunk in range((rays.order.shape[0] // len(lanes) + _CHUNK - 1) // _CHUNK):
-        _occluded_chunk(chunk, lanes, scene, rays, near, distances, blocked)
+def occluded_parallel(lanes, others, ground, origins, directions, times, order, near, limits, blocked):
+    """`occluded` on numba's threads."""
+    rays = origins, directions, times, order
+    for chunk in nb.prange(_chunks(order, lanes)):
+        _occluded_chunk(chunk, lanes, others, ground, rays, np.float32(near), limits, blocked)

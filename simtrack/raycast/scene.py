@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from threading import RLock
 from types import TracebackType
 
@@ -16,21 +16,22 @@ from simtrack.raycast import fallback, instancing, kernels
 from simtrack.raycast.bundle import RayBundle
 from simtrack.raycast.hits import ClosestPoints, RayHits
 from simtrack.raycast.mesh import TriangleMesh
+from simtrack.raycast.table import InstanceTable, checked_poses
 
 MAX_INSTANCE = 1 << 21
 """Instance ids are below this: tables are indexed by them."""
+_MAX_LISTED = 256
+"""Kernels look at instances one by one, to see which rays may meet them, up to this number of them."""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Instance:
-    """A mesh in the scene."""
+    """A mesh in the scene, as the fallback needs it."""
 
     mesh: TriangleMesh
     keys: Float64
     """(K, 4, 4), T_map_mesh at equidistant times 0..1; K = 1 at rest."""
-    enabled: bool = True
-    geometry: int = field(default=0)
-    """Address of the RTCGeometry, 0 in the fallback."""
+    enabled: bool
 
 
 class RayScene:
@@ -39,6 +40,9 @@ class RayScene:
     Moving an instance costs microseconds plus `commit`; meshes are shared, never copied. Casting is thread-safe and
     releases the interpreter lock; changing the scene while another thread casts is not allowed (changes are serialised
     among themselves). The threads used are ``numba.get_num_threads()``; results do not depend on their number.
+
+    The largest instance that stands at the identity, such as a static map, is the ground: rays are traced in its mesh
+    directly, and through the hierarchy of instances only where one of the others may be met.
     """
 
     def __init__(self, use_fallback: bool | None = None) -> None:
@@ -52,13 +56,18 @@ class RayScene:
             RaycastError: `use_fallback` is False and the library cannot be used.
         """
         self.fallback = (rtc.fallback_forced() or not rtc.available()) if use_fallback is None else use_fallback
-        self._instances: dict[int, Instance] = {}
+        self._meshes: dict[int, TriangleMesh] = {}
+        self._motions: dict[int, Float64] = {}
+        self._table = InstanceTable()
         self._lock = RLock()
-        self._dirty = True
+        self._dirty = self._members_changed = True
+        self._motions_changed = self._ground_stale = False
+        self._first_free = 0
         self._top = 0
+        self._ground: int | None = None
+        self._others = np.zeros(0, np.int32)
+        self._world: tuple[object, ...] = ()
         self._closed = False
-        self._keeper = instancing.TableKeeper()
-        self._table = self._keeper.update(self._instances)
         if not self.fallback:
             api = rtc.embree().api
             self._top = api.rtcNewScene(rtc.embree().device)
@@ -71,15 +80,19 @@ class RayScene:
     @property
     def instances(self) -> tuple[int, ...]:
         """Ids of all instances, ascending."""
-        return tuple(sorted(self._instances))
+        return tuple(sorted(self._meshes))
 
     def mesh(self, instance: int) -> TriangleMesh:
         """The mesh of an instance."""
-        return self._get(instance).mesh
+        return self._meshes[self._known(instance)]
 
     def pose(self, instance: int) -> Float64:
         """(4, 4) T_map_mesh of an instance (of its first motion key)."""
-        return self._get(instance).keys[0].copy()
+        return self._table.poses[self._known(instance)].copy()
+
+    def enabled(self, instance: int) -> bool:
+        """Whether an instance is shown to rays and queries."""
+        return bool(self._table.enabled[self._known(instance)])
 
     def add(self, mesh: TriangleMesh, T_map_mesh: npt.ArrayLike | None = None, instance: int | None = None) -> int:
         """Place an instance of `mesh`.
@@ -94,78 +107,79 @@ class RayScene:
 
         Raises:
             InvalidValueError: the id is taken or out of range, or the transform is not an invertible affine one.
+            RaycastError: Embree could not build the mesh's hierarchy.
         """
         with self._lock:
             if instance is None:
-                instance = next(i for i in range(MAX_INSTANCE + 1) if i not in self._instances)
-            self.add_many([mesh], np.eye(4)[None] if T_map_mesh is None else T_map_mesh, [instance])
+                while self._first_free in self._meshes:
+                    self._first_free += 1
+                instance = self._first_free
+            self.add_many([mesh], np.eye(4) if T_map_mesh is None else T_map_mesh, [instance])
         return instance
 
     def add_many(self, meshes: Sequence[TriangleMesh], T_map_mesh: npt.ArrayLike, instances: Sequence[int]) -> None:
         """Place several instances at once, see `add`; `T_map_mesh` (N, 4, 4). If one is refused, none is placed."""
         if not len(instances):
             return
-        keys = _checked_transforms(T_map_mesh, "T_map_mesh")
-        if not len(meshes) == len(keys) == len(instances):
-            shape = len(meshes), keys.shape, len(instances)
+        poses = checked_poses(T_map_mesh, "T_map_mesh")
+        if not len(meshes) == len(poses) == len(instances):
+            shape = len(meshes), poses.shape, len(instances)
             raise InvalidValueError("meshes, T_map_mesh, instances", shape, "as many of each")
         with self._lock:
             self._open()
             new = set(instances)
             for number in instances:
-                if number in self._instances or not 0 <= number < MAX_INSTANCE or len(new) < len(instances):
+                if number in self._meshes or not 0 <= number < MAX_INSTANCE or len(new) < len(instances):
                     allowed = f"0..{MAX_INSTANCE - 1}, each once, and not one of {self.instances}"
                     raise InvalidValueError("instance", number, allowed)
-            entries = [Instance(mesh, keys[k : k + 1]) for k, mesh in enumerate(meshes)]
             if not self.fallback:
-                scenes = np.array([mesh.scene_handle for mesh in meshes], np.int64)
-                numbers, geometries = np.array(instances, np.int64), np.zeros(len(entries), np.int64)
-                arguments = scenes, numbers, instancing.columns(keys), geometries
-                instancing.place(rtc.embree().device, self._top, *arguments)
-                rtc.embree().check("rtcAttachGeometryByID")
-                for entry, geometry in zip(entries, geometries.tolist(), strict=True):
-                    entry.geometry = geometry
-            self._instances.update(zip(instances, entries, strict=True))
-            self._keeper.changed(instances)
-            self._dirty = True
+                for mesh in meshes:
+                    _ = mesh.scene_handle  # raises, if it cannot be built, before anything has changed
+            numbers = np.array(instances, np.int64)
+            self._ground_stale |= self._table.add(numbers, meshes, poses)
+            self._meshes.update(zip(instances, meshes, strict=True))
+            if not self.fallback:
+                self._attach(numbers)
+            self._members_changed = self._dirty = True
 
     def remove(self, instance: int) -> None:
         """Take an instance out; its id becomes free, the others keep theirs."""
         self.remove_many([instance])
 
     def remove_many(self, instances: Sequence[int]) -> None:
-        """Take several instances out at once, see `remove`."""
-        chosen = list(dict.fromkeys(instances))
+        """Take several instances out at once, see `remove`. If one is unknown, none is taken out."""
         with self._lock:
-            for instance in chosen:
-                self._get(instance)
-            if not self.fallback:
-                instancing.detach(self._top, np.array(chosen, np.int64))
-                rtc.embree().check("rtcDetachGeometry")
-            for instance in chosen:
-                del self._instances[instance]
-            self._dirty = True
+            numbers = np.array([self._known(instance) for instance in dict.fromkeys(instances)], np.int64)
+            self._detach(numbers)
+            self._ground = None if self._ground in numbers else self._ground
+            table = self._table
+            self._ground_stale |= bool(table.unmoved[numbers].any())
+            table.enabled[numbers] = table.unmoved[numbers] = False
+            for number in numbers.tolist():
+                self._motions_changed |= self._motions.pop(number, None) is not None
+                del self._meshes[number]
+                self._first_free = min(self._first_free, number)
+            self._members_changed = self._dirty = True
 
     def set_pose(self, instance: int, T_map_mesh: npt.ArrayLike) -> None:
         """Move an instance to the (4, 4) affine transform `T_map_mesh` and end any motion of it."""
-        self._set_keys(instance, _checked_transforms(T_map_mesh, "T_map_mesh"))
+        self.set_poses((instance,), T_map_mesh)
 
     def set_poses(self, instances: Sequence[int], T_map_mesh: npt.ArrayLike) -> None:
-        """Move several instances at once, see `set_pose`; `T_map_mesh` (N, 4, 4)."""
+        """Move several instances at once, see `set_pose`; `T_map_mesh` (N, 4, 4). If one is unknown, none is moved."""
         if not len(instances):
             return
-        keys = _checked_transforms(T_map_mesh, "T_map_mesh")
-        if len(keys) != len(instances):
-            raise InvalidValueError("T_map_mesh", keys.shape, f"({len(instances)}, 4, 4)")
+        poses = checked_poses(T_map_mesh, "T_map_mesh", len(instances))
         with self._lock:
-            entries = [self._get(instance) for instance in instances]
-            for k, entry in enumerate(entries):
-                entry.keys = keys[k : k + 1]
+            numbers = np.array([self._known(instance) for instance in instances], np.int64)
+            if self._motions:
+                for instance in instances:
+                    self._motions_changed |= self._motions.pop(instance, None) is not None
+            self._ground_stale |= self._table.place(numbers, poses)
             if not self.fallback:
-                geometries = np.array([entry.geometry for entry in entries], np.int64)
-                instancing.move(geometries, instancing.columns(keys))
-                rtc.embree().check("rtcSetGeometryTransform")
-            self._keeper.changed(instances)
+                geometries = self._table.handles[numbers]
+                held = geometries != 0
+                instancing.move(geometries[held], instancing.columns(poses[held]))
             self._dirty = True
 
     def set_motion(self, instance: int, T_keys: npt.ArrayLike) -> None:
@@ -176,23 +190,27 @@ class RayScene:
             T_keys: (K, 4, 4) T_map_mesh at K = 1..129 equidistant times from 0 to 1; between them the matrices are
                 interpolated linearly, element by element (so keys of a rotating body must be close to one another).
         """
-        keys = _checked_transforms(T_keys, "T_keys")
+        keys = checked_poses(T_keys, "T_keys")
         if not 1 <= len(keys) <= rtc.RTC_MAX_TIME_STEP_COUNT:
             raise InvalidValueError("T_keys", keys.shape, f"1..{rtc.RTC_MAX_TIME_STEP_COUNT} keys")
-        self._set_keys(instance, keys)
+        with self._lock:
+            self.set_poses((instance,), keys[:1])
+            if len(keys) > 1:
+                self._motions[instance] = keys
+                self._ground_stale |= bool(self._table.unmoved[instance])
+                self._table.unmoved[instance] = False
+                self._motions_changed = True
+                self._tell_motion(instance)
 
     def set_enabled(self, instance: int, enabled: bool) -> None:
         """Show an instance to rays and queries, or hide it."""
         with self._lock:
-            entry = self._get(instance)
-            if entry.enabled == enabled:
-                return
-            entry.enabled = enabled
-            if entry.geometry:
-                api = rtc.embree().api
-                (api.rtcEnableGeometry if enabled else api.rtcDisableGeometry)(entry.geometry)
-                api.rtcCommitGeometry(entry.geometry)
-            self._dirty = True
+            number, table = self._known(instance), self._table
+            if table.enabled[number] != enabled:
+                table.enabled[number] = enabled
+                self._show(number)
+                self._ground_stale |= bool(table.unmoved[number])
+                self._members_changed = self._dirty = True
 
     def commit(self) -> None:
         """Make changes effective; casting does it by itself where needed.
@@ -200,15 +218,15 @@ class RayScene:
         Raises:
             RaycastError: Embree could not build the scene.
         """
+        if not self._dirty and not self._closed:
+            return
         with self._lock:
             self._open()
-            if not self._dirty:
-                return
+            if self._motions_changed:
+                self._table.set_motions(self._motions)
             if not self.fallback:
-                rtc.embree().api.rtcCommitScene(self._top)
-                rtc.embree().check("rtcCommitScene")
-                self._table = self._keeper.update(self._instances)
-            self._dirty = False
+                self._commit()
+            self._dirty = self._members_changed = self._motions_changed = self._ground_stale = False
 
     # ------------------------------------------------------------------------------------------------------ queries
 
@@ -220,7 +238,7 @@ class RayScene:
         *,
         min_distance: float = 0.0,
         time: float = 0.0,
-        coherent: bool = True,
+        coherent: bool | None = None,
         out: RayHits | None = None,
     ) -> RayHits:
         """Cast a bundle from one sensor pose.
@@ -232,23 +250,22 @@ class RayScene:
             min_distance: nearest hit, likewise.
             time: of moving instances, 0..1.
             coherent: whether neighbouring rays meet the same few triangles, as a whole image's do; False is faster
-                for rays some pixels apart on finely meshed things. The results are the same.
+                for rays some pixels apart on finely meshed things. None decides ray by ray, from the size of what they
+                may meet and its number of faces. The results are the same.
             out: results to overwrite and return (from `RayHits.empty`); saves the allocation.
         """
-        T = _checked_transforms(T_map_sensor, "T_map_sensor")[0]
+        T = checked_poses(T_map_sensor, "T_map_sensor", 1)[0]
         self.commit()
         hits = RayHits.reuse(out, len(bundle))
-        rotation, origin = T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32)
-        limits = np.float32(min_distance), np.float32(max_distance)
         if self.fallback:
-            rays = bundle.directions @ rotation.T
-            times = np.full(len(bundle), time)
-            fallback.cast(self._instances, np.broadcast_to(origin, rays.shape), rays, times, *limits, hits)
+            rays = bundle.directions @ T[:3, :3].astype(np.float32).T
+            origins = np.broadcast_to(T[:3, 3].astype(np.float32), rays.shape)
+            limits = np.float32(min_distance), np.float32(max_distance)
+            fallback.cast(self._posed(), origins, rays, np.full(len(bundle), time), *limits, hits)
         elif len(bundle):
-            rays = kernels.Bundle(bundle.packed, bundle.order, rotation, origin, np.float32(time), coherent)
-            lanes = (0,) * bundle.packed.shape[2]
-            output = kernels.Output(hits.distances, hits.normals, hits.faces, hits.instances)
-            arguments = (lanes, self._top, rays, *limits, self._table, output)
+            lanes, output = (0,) * bundle.packed.shape[2], (hits.distances, hits.normals, hits.faces, hits.instances)
+            rays = bundle.packed, bundle.order, bundle.cones, T, float(time), float(min_distance), float(max_distance)
+            arguments = (lanes, *self._world, *rays, -1 if coherent is None else int(coherent), *output)
             kernels.run(len(bundle), kernels.cast_bundle, kernels.cast_bundle_parallel, *arguments)
         return hits
 
@@ -278,14 +295,12 @@ class RayScene:
         rays = _checked_rays(origins, directions, times, packing)
         self.commit()
         hits = RayHits.reuse(out, len(rays[0]))
-        limits = np.float32(min_distance), np.float32(max_distance)
         if self.fallback:
-            fallback.cast(self._instances, *rays[:3], *limits, hits)
+            fallback.cast(self._posed(), *rays[:3], np.float32(min_distance), np.float32(max_distance), hits)
         elif len(rays[0]):
-            lanes = (0,) * rtc.embree().packet_width
-            output = kernels.Output(hits.distances, hits.normals, hits.faces, hits.instances)
-            arguments = (lanes, self._top, kernels.Rays(*rays), *limits, packing is not None, self._table, output)
-            kernels.run(len(rays[0]), kernels.cast_rays, kernels.cast_rays_parallel, *arguments)
+            lanes, output = (0,) * rtc.embree().packet_width, (hits.distances, hits.normals, hits.faces, hits.instances)
+            arguments = (*rays, float(min_distance), float(max_distance), packing is not None, *output)
+            kernels.run(len(rays[0]), kernels.cast_rays, kernels.cast_rays_parallel, lanes, *self._world, *arguments)
         return hits
 
     def occluded(
@@ -303,12 +318,13 @@ class RayScene:
         self.commit()
         if self.fallback:
             hits = RayHits.empty(len(limit))
-            fallback.cast(self._instances, *rays[:3], np.float32(min_distance), np.float32(np.inf), hits)
+            fallback.cast(self._posed(), *rays[:3], np.float32(min_distance), np.float32(np.inf), hits)
             return hits.distances < limit
         blocked = np.zeros(len(limit), np.bool_)
         if len(limit):
             lanes = (0,) * rtc.embree().packet_width
-            kernels.occluded(lanes, self._top, kernels.Rays(*rays), np.float32(min_distance), limit, blocked)
+            arguments = (lanes, *self._world[:2], *rays, float(min_distance), limit, blocked)
+            kernels.run(len(limit), kernels.occluded, kernels.occluded_parallel, *arguments)
         return blocked
 
     def closest_points(self, points: npt.ArrayLike, max_distance: float = np.inf) -> ClosestPoints:
@@ -321,7 +337,7 @@ class RayScene:
         Raises:
             InvalidValueError: wrong shape, or a negative distance.
         """
-        queries = np.ascontiguousarray(points, np.float32)
+        queries = np.require(points, np.float32, ["C", "W"])
         if queries.ndim != 2 or queries.shape[1] != 3:
             raise InvalidValueError("points", queries.shape, "(N, 3)")
         if not max_distance >= 0:
@@ -330,13 +346,13 @@ class RayScene:
         count = len(queries)
         found = ClosestPoints.empty(count)
         if self.fallback:
-            fallback.closest(self._instances, queries, max_distance, found)
+            fallback.closest(self._posed(), queries, max_distance, found)
         elif count:
             from simtrack.raycast import closest
 
             output = (found.points, found.distances, found.instances, found.faces)
-            arguments = (self._top, closest.CALLBACK, queries, np.float32(max_distance), self._geometry(), output)
-            kernels.run(count, closest.closest, closest.closest_parallel, *arguments)
+            arguments = (closest.CALLBACK, queries, float(max_distance), self._table.buffers, self._table.poses)
+            kernels.run(16 * count, closest.closest, closest.closest_parallel, *self._world[:3], *arguments, *output)
         return found
 
     # -------------------------------------------------------------------------------------------------- life and end
@@ -347,7 +363,7 @@ class RayScene:
             if not self._closed and not self.fallback:
                 self._release()
             self._closed = True
-            self._instances.clear()
+            self._meshes.clear()
 
     def __enter__(self) -> "RayScene":
         return self
@@ -363,68 +379,94 @@ class RayScene:
         if self._closed:
             raise RaycastError("the ray scene is closed")
 
-    def _get(self, instance: int) -> Instance:
+    def _known(self, instance: int) -> int:
         self._open()
-        entry = self._instances.get(instance)
-        if entry is None:
+        if instance not in self._meshes:
             raise InvalidValueError("instance", instance, f"one of {self.instances}")
-        return entry
+        return instance
 
-    def _set_keys(self, instance: int, keys: Float64) -> None:
-        with self._lock:
-            entry = self._get(instance)
-            entry.keys = keys
-            if entry.geometry:
-                _write_keys(entry)
-            self._keeper.changed([instance])
-            self._dirty = True
+    def _posed(self) -> dict[int, Instance]:
+        poses, enabled = self._table.poses, self._table.enabled
+        return {
+            number: Instance(mesh, self._motions.get(number, poses[number : number + 1]), bool(enabled[number]))
+            for number, mesh in self._meshes.items()
+        }
 
-    def _geometry(self) -> object:
-        """Addresses of the instances' buffers and their poses, for point queries."""
-        from simtrack.raycast import closest
+    def _attach(self, numbers: npt.NDArray[np.int64]) -> None:
+        """Put instances into Embree's hierarchy."""
+        table, geometries = self._table, np.zeros(len(numbers), np.int64)
+        scenes = np.array([self._meshes[number].scene_handle for number in numbers.tolist()], np.int64)
+        columns = instancing.columns(table.poses[numbers])
+        instancing.place(rtc.embree().device, self._top, scenes, numbers, columns, geometries)
+        rtc.embree().check("rtcAttachGeometryByID")
+        table.handles[numbers] = geometries
+        for number in numbers[~table.enabled[numbers]].tolist():
+            self._show(number)
+        for number in self._motions.keys() & set(numbers.tolist()):
+            self._tell_motion(number)
 
-        size = max(self._instances, default=-1) + 1
-        buffers, poses = np.zeros((size, 2), np.int64), np.zeros((size, 3, 4))
-        for number, entry in self._instances.items():
-            buffers[number] = entry.mesh.vertices.ctypes.data, entry.mesh.faces.ctypes.data
-            poses[number] = entry.keys[0, :3]
-        return closest.Geometry(buffers, poses)
+    def _detach(self, numbers: npt.NDArray[np.int64]) -> None:
+        held = numbers[self._table.handles[numbers] != 0]
+        if len(held):
+            self._table.handles[held] = 0
+            instancing.detach(self._top, held)
+            rtc.embree().check("rtcDetachGeometry")
 
+    def _show(self, number: int) -> None:
+        geometry = int(self._table.handles[number])
+        if geometry:
+            api = rtc.embree().api
+            (api.rtcEnableGeometry if self._table.enabled[number] else api.rtcDisableGeometry)(geometry)
+            api.rtcCommitGeometry(geometry)
 
-def _write_keys(entry: Instance) -> None:
-    api = rtc.embree().api
-    api.rtcSetGeometryTimeStepCount(entry.geometry, len(entry.keys))
-    for step, key in enumerate(entry.keys):
-        columns = np.ascontiguousarray(key[:3].T, np.float32)
-        layout = rtc.RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR
-        api.rtcSetGeometryTransform(entry.geometry, step, layout, columns.ctypes.data)
-    api.rtcCommitGeometry(entry.geometry)
-    rtc.embree().check("rtcSetGeometryTransform")
+    def _tell_motion(self, number: int) -> None:
+        geometry, keys = int(self._table.handles[number]), self._motions[number]
+        if geometry:
+            api = rtc.embree().api
+            api.rtcSetGeometryTimeStepCount(geometry, len(keys))
+            for step, key in enumerate(keys):
+                columns = np.ascontiguousarray(key[:3].T, np.float32)
+                layout = rtc.RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR
+                api.rtcSetGeometryTransform(geometry, step, layout, columns.ctypes.data)
+            api.rtcCommitGeometry(geometry)
 
+    def _commit(self) -> None:
+        if self._ground_stale:
+            self._choose_ground()
+        table = self._table
+        if self._members_changed or self._ground_stale:
+            shown = table.enabled.copy()
+            if self._ground is not None:
+                shown[self._ground] = False
+            self._others = np.flatnonzero(shown).astype(np.int32)
+        rtc.embree().api.rtcCommitScene(self._top)
+        rtc.embree().check("rtcCommitScene")
+        ground = (0, -1) if self._ground is None else (self._meshes[self._ground].scene_handle, self._ground)
+        listed = self._others if len(self._others) <= _MAX_LISTED else self._others[:0]
+        self._world = (self._top if len(self._others) else 0, *ground, listed, table.rows, table.motion, table.keys)
 
-def _checked_transforms(T: npt.ArrayLike, name: str) -> Float64:
-    """(K, 4, 4) copy of one or several affine transforms."""
-    keys = np.array(T, dtype=np.float64)
-    if keys.ndim == 2:
-        keys = keys[None]
-    allowed = "finite invertible affine 4x4 with last row 0 0 0 1"
-    if keys.ndim != 3 or keys.shape[1:] != (4, 4) or not len(keys):
-        raise InvalidValueError(name, keys.shape, allowed)
-    if not np.isfinite(keys).all() or (keys[:, 3] != (0.0, 0.0, 0.0, 1.0)).any():
-        raise InvalidValueError(name, keys.tolist(), allowed)
-    if (np.abs(np.linalg.det(keys[:, :3, :3])) < 1e-18).any():
-        raise InvalidValueError(name, keys.tolist(), allowed)
-    return keys
+    def _choose_ground(self) -> None:
+        """The largest enabled instance at the identity leaves the hierarchy of instances; what was there returns."""
+        table = self._table
+        candidates = np.flatnonzero(table.enabled & table.unmoved)
+        best = int(candidates[np.argmax(table.rows[candidates, 12])]) if len(candidates) else None
+        if best == self._ground:
+            return
+        former, self._ground = self._ground, best
+        if former is not None and former in self._meshes and not table.handles[former]:
+            self._attach(np.array([former]))
+        if best is not None:
+            self._detach(np.array([best]))
 
 
 def _checked_rays(
     origins: npt.ArrayLike, directions: npt.ArrayLike, times: npt.ArrayLike | None, packing: RayBundle | None
 ) -> tuple[Float32, Float32, Float32, Int32]:
-    starts, rays = np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32)
+    starts, rays = np.require(origins, np.float32, ["C", "W"]), np.require(directions, np.float32, ["C", "W"])
     if rays.ndim != 2 or rays.shape[1] != 3 or starts.shape != rays.shape:
         raise InvalidValueError("origins, directions", (starts.shape, rays.shape), "two arrays (N, 3)")
     count = len(rays)
-    moments = np.empty(0, np.float32) if times is None else np.ascontiguousarray(times, np.float32)
+    moments = np.empty(0, np.float32) if times is None else np.require(times, np.float32, ["C", "W"])
     if times is not None and moments.shape != (count,):
         raise InvalidValueError("times", moments.shape, f"({count},)")
     if packing is not None:

@@ -1,0 +1,142 @@
+"""The ground is traced by itself, and rays that meet no other instance's sphere skip the others: nobody can tell."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from simtrack.contracts import CameraIntrinsics
+from simtrack.geometry.transforms import exp_so3, look_at, transform
+from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
+from simtrack.raycast import scene as scenes
+
+CAMERA = CameraIntrinsics(160, 120, 110.0, 110.0, 79.5, 59.5)
+ROOM = trimesh.creation.box((8.0, 6.0, 3.0)).subdivide().subdivide()
+BALL = trimesh.creation.icosphere(subdivisions=4, radius=0.2)
+TURN = exp_so3(np.array([0.3, -0.5, 0.9]))
+
+
+def shape(mesh: trimesh.Trimesh) -> TriangleMesh:
+    return TriangleMesh(mesh.vertices, mesh.faces)
+
+
+def placed(count: int, seed: int = 0) -> list[np.ndarray]:
+    """Poses in the room, with sizes from 1 to 3 and mirrored ones."""
+    rng = np.random.default_rng(seed)
+    poses = []
+    for k in range(count):
+        scale = np.diag(rng.uniform(1.0, 3.0, 3) * [1, 1, -1 if k % 3 == 0 else 1])
+        poses.append(transform(exp_so3(rng.normal(size=3)) @ scale, rng.uniform((-3.5, -2.5, -1), (3.5, 2.5, 1))))
+    return poses
+
+
+def baked(poses: list[np.ndarray], room: np.ndarray) -> TriangleMesh:
+    """Room and balls in one mesh, map frame."""
+    parts = [ROOM.copy().apply_transform(room)] + [BALL.copy().apply_transform(T) for T in poses]
+    vertices = np.concatenate([part.vertices for part in parts])
+    first = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    return TriangleMesh(vertices, np.concatenate([part.faces + k for part, k in zip(parts, first, strict=True)]))
+
+
+def assert_same(hits: RayHits, expected: RayHits) -> None:
+    np.testing.assert_allclose(hits.distances, expected.distances, atol=2e-5)
+    hit = expected.hit
+    same = np.einsum("ij,ij->i", hits.normals[hit], expected.normals[hit]) > 0.999
+    assert same.mean() > 0.995  # a ray through an edge may be given to either face
+
+
+@pytest.mark.parametrize("count", [0, 1, 12])
+@pytest.mark.parametrize("room", [np.eye(4), transform(TURN, (0.1, -0.2, 0.05))], ids=["at identity", "posed"])
+def test_queries_equal_those_of_one_baked_mesh(count: int, room: np.ndarray) -> None:
+    poses = placed(count)
+    origins = np.random.default_rng(1).uniform(-1, 1, (3000, 3))
+    directions = np.random.default_rng(2).normal(size=(3000, 3))
+    bundles = RayBundle.from_camera(CAMERA), RayBundle.from_directions(directions)
+    with RayScene() as scene, RayScene() as oracle:
+        scene.add(shape(ROOM), room)
+        for T in poses:
+            scene.add(shape(BALL), T)
+        oracle.add(baked(poses, room))
+        for eye in ((0.0, 0.0, 0.0), (3.0, -2.0, 1.0), (-30.0, 4.0, 2.0)):
+            T_map_sensor = look_at(np.array(eye), np.array([0.3, 0.4, -0.2]))
+            for bundle in bundles:
+                assert_same(scene.cast(bundle, T_map_sensor), oracle.cast(bundle, T_map_sensor))
+        assert_same(scene.cast_rays(origins, directions), oracle.cast_rays(origins, directions))
+        limits = np.random.default_rng(3).uniform(0.3, 4.0, 3000)
+        blocked = scene.occluded(origins, directions, limits)
+        assert (blocked == oracle.occluded(origins, directions, limits)).mean() > 0.999
+        found, expected = scene.closest_points(origins[:500]), oracle.closest_points(origins[:500])
+        np.testing.assert_allclose(found.distances, expected.distances, atol=2e-6)
+
+
+def test_coherence_is_a_matter_of_speed() -> None:
+    bundle, T = RayBundle.from_camera(CAMERA), look_at(np.array([1.0, 2.0, 1.0]), np.zeros(3))
+    with RayScene() as scene:
+        scene.add(shape(ROOM))
+        for pose in placed(12):
+            scene.add(shape(BALL), pose)
+        for coherent in (True, False):
+            assert_same(scene.cast(bundle, T, coherent=coherent), scene.cast(bundle, T))
+
+
+def test_culling_loses_no_hit_of_many_instances_near_or_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    ball, far_away = shape(BALL), np.array([3000.0, -2000.0, 40.0])
+    for offset in (np.zeros(3), far_away):
+        with RayScene() as scene, RayScene() as asks_all:
+            for world in (scene, asks_all):
+                world.add(shape(ROOM), transform(translation=offset))
+                for T in placed(100, seed=6):
+                    T[:3, 3] += offset
+                    world.add(ball, T)
+            monkeypatch.setattr(scenes, "_MAX_LISTED", 1000)
+            scene.commit()
+            monkeypatch.setattr(scenes, "_MAX_LISTED", 0)
+            asks_all.commit()
+            for _ in range(5):
+                T = transform(exp_so3(rng.normal(size=3)), offset + rng.uniform(-1, 1, 3))
+                a, b = (world.cast(RayBundle.from_camera(CAMERA), T, coherent=True) for world in (scene, asks_all))
+                np.testing.assert_array_equal(a.instances, b.instances)
+                np.testing.assert_array_equal(a.distances, b.distances)
+
+
+def test_the_ground_changes_with_poses_and_visibility() -> None:
+    """Whatever stands at the identity, is hidden, removed or moves, a ray from above meets what is there."""
+    towards, eye = np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 0.0, 9.0]])
+    ball = shape(trimesh.creation.icosphere(radius=1.0))
+    with RayScene() as scene:
+
+        def seen() -> tuple[int, float]:
+            hits = scene.cast_rays(eye, towards)
+            bundle = scene.cast(RayBundle.from_directions(towards), transform(translation=eye[0]))
+            assert bundle.instances[0] == hits.instances[0]
+            return int(hits.instances[0]), round(float(hits.distances[0]), 3)
+
+        small = scene.add(ball)
+        big = scene.add(ball, np.diag([2.0, 2.0, 2.0, 1.0]))
+        assert seen() == (big, 7.0)
+        scene.set_pose(big, transform(translation=(9.0, 0.0, 0.0)))
+        assert seen() == (small, 8.0)
+        scene.set_enabled(small, False)
+        assert not scene.enabled(small)
+        assert seen() == (-1, np.inf)
+        scene.set_poses((small, big), np.stack([np.eye(4), transform(translation=(0.0, 0.0, 1.0))]))
+        assert seen() == (big, 7.0)
+        scene.set_enabled(small, True)
+        scene.set_motion(small, np.stack([np.eye(4), transform(translation=(0.0, 0.0, 6.0))]))
+        assert scene.cast_rays(eye, towards, [1.0]).distances[0] == pytest.approx(2.0, abs=1e-4)
+        scene.set_pose(big, np.eye(4))
+        assert seen()[1] == 8.0
+        scene.set_pose(small, transform(translation=(0.0, 0.0, 2.0)))
+        assert seen() == (small, 6.0)
+        scene.remove(big)
+        assert scene.add(ball, np.diag([3.0, 3.0, 0.5, 1.0]), instance=big) == big
+        assert seen() == (small, 6.0)
+        scene.set_pose(small, np.eye(4))
+        assert seen() == (small, 8.0)
+        scene.remove_many([small])
+        assert seen() == (big, 8.5)
+        scene.set_pose(big, np.eye(4))
+        scene.remove(big)
+        assert seen() == (-1, np.inf)
+        assert scene.add(ball) == small
+        assert seen() == (small, 8.0)
