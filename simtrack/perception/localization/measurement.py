@@ -7,6 +7,7 @@ import numpy as np
 from simtrack.contracts import NANOSECONDS, Bool, Float32, Float64, Int32, LidarScan, RgbdFrame
 from simtrack.geometry.transforms import inverse
 from simtrack.perception.localization.motion import OdometryTrack
+from simtrack.raycast import RayBundle
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,18 +105,16 @@ def depth_measurement(frame: RgbdFrame, stride: int, max_range: float, mask: Boo
     `mask` is (H, W), True for pixels to leave out. The standard deviation is that of the Xtion (Nguyen et al. 2012),
     carried from depth to the ray.
     """
-    from simtrack.sensors.camera import pixel_rays
     from simtrack.sensors.depth_noise import axial_sigma
 
-    height, width = frame.depth.shape
-    rays = pixel_rays(frame.intrinsics).reshape(height, width, 3)[::stride, ::stride].reshape(-1, 3).astype(np.float64)
-    pixels = np.arange(height * width).reshape(height, width)[::stride, ::stride].ravel()
-    depth = frame.depth[::stride, ::stride].ravel().astype(np.float64)
+    bundle = RayBundle.from_camera(frame.intrinsics, stride=stride)
+    pixels = np.asarray(bundle.pixels)
+    depth = frame.depth.ravel()[pixels].astype(np.float64)
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(depth) & (depth > 0.0) & (depth <= max_range)
     if mask is not None:
-        valid &= ~mask[::stride, ::stride].ravel()
-    rays, depth, pixels = rays[valid], depth[valid], pixels[valid]
+        valid &= ~mask.ravel()[pixels]
+    rays, depth, pixels = bundle.directions[valid].astype(np.float64), depth[valid], pixels[valid]
     length = np.sqrt((rays * rays).sum(axis=1))
     T = np.asarray(frame.T_base_camera, dtype=float)
     directions = (rays / length[:, None]) @ T[:3, :3].T
@@ -126,5 +125,5 @@ def depth_measurement(frame: RgbdFrame, stride: int, max_range: float, mask: Boo
         directions=np.ascontiguousarray(directions, np.float32),
         ranges=(depth * length).astype(np.float32),
         sigmas=sigmas.astype(np.float32),
-        shots=pixels.astype(np.int32),
+        shots=pixels,
     )
