@@ -103,7 +103,7 @@ def test_every_package_that_is_imported_is_a_declared_dependency() -> None:
     """A machine that has more installed would hide a missing one."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    declared = {re.split(r"[\[<>=~!; ]", line)[0] for line in project["dependencies"] + extras["viz"]}
+    declared = {re.split(r"[\[<>=~!; ]", line)[0] for line in project["dependencies"] + extras["viz"] + extras["bench"]}
     modules = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in declared} | {"simtrack"}
     modules |= {"llvmlite", "markupsafe", "pydantic_core"}  # halves of numba, jinja2 and pydantic
     modules |= set(sys.stdlib_module_names)
