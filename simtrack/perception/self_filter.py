@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtrack.contracts import Bool, CameraIntrinsics, Float32, LidarScan, RgbdFrame
+from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, LidarScan, RgbdFrame
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
@@ -23,12 +23,38 @@ class SelfFilterConfig:
     """Pixels by which the predicted silhouette is widened in images; the shots next to it in scans likewise."""
     stride: int = 2
     """Every how many-th pixel of an image is cast; the silhouette is widened accordingly."""
+    tolerance: float = 0.005
+    """m that a link may have moved before it is placed anew: encoders tremble, and `margin` covers that."""
 
     def __post_init__(self) -> None:
-        if not (self.margin >= 0.0 and self.relative >= 0.0):
-            raise InvalidValueError("SelfFilterConfig.margin, relative", (self.margin, self.relative), ">= 0")
+        if not (self.margin >= 0.0 and self.relative >= 0.0 and self.tolerance >= 0.0):
+            values = self.margin, self.relative, self.tolerance
+            raise InvalidValueError("SelfFilterConfig.margin, relative, tolerance", values, ">= 0")
         if self.edge < 0 or self.stride < 1:
             raise InvalidValueError("SelfFilterConfig.edge, stride", (self.edge, self.stride), "edge >= 0, stride >= 1")
+
+
+class _Turn:
+    """The shots of a lidar's turn, which are the same every time, and where they meet the body."""
+
+    def __init__(self, scan: LidarScan) -> None:
+        self.directions, self.rings = scan.directions.copy(), scan.rings.copy()
+        self.bundle = RayBundle.from_directions(self.directions, groups=self.rings)
+        self.order = np.argsort(self.rings, kind="stable")
+        self.T_base_lidar = np.eye(4)
+        self.body: Float32 | None = None
+        """(N,), metres to the body, silhouette widened; None where it has to be cast."""
+
+    def same_shots(self, scan: LidarScan) -> bool:
+        return np.array_equal(self.directions, scan.directions) and np.array_equal(self.rings, scan.rings)
+
+    def nearest_in_ring(self, distances: Float32) -> Float32:
+        """Minimum over each shot and its neighbours in the same ring; rings are taken to be in order of time."""
+        line = distances[self.order]
+        padded = np.concatenate([line[:1], line, line[-1:]])
+        out = np.empty_like(distances)
+        out[self.order] = np.minimum(np.minimum(padded[:-2], line), padded[2:])
+        return out
 
 
 class SelfFilter:
@@ -56,8 +82,12 @@ class SelfFilter:
             for link in robot.links
             if len(link.faces)
         }
+        self._reach = {
+            link.name: float(np.linalg.norm(link.vertices, axis=1).max()) for link in robot.links if len(link.faces)
+        }
         self._bundles: dict[tuple[CameraIntrinsics, int], RayBundle] = {}
-        self._lidar_bundle: tuple[Float32, RayBundle] | None = None
+        self._turn: _Turn | None = None
+        self._placed: dict[str, Float64] = {}
         self._posture: tuple[tuple[str, float], ...] | None = None
 
     def lidar_mask(self, scan: LidarScan, positions: Mapping[str, float]) -> Bool:
@@ -68,13 +98,16 @@ class SelfFilter:
             positions: joint name -> rad or m.
         """
         self._place(positions)
-        if self._lidar_bundle is None or not np.array_equal(self._lidar_bundle[0], scan.directions):
-            bundle = RayBundle.from_directions(scan.directions, groups=scan.rings)
-            self._lidar_bundle = (scan.directions.copy(), bundle)
-        body = self._scene.cast(self._lidar_bundle[1], scan.T_base_lidar, max_distance=3.0, min_distance=0.06).distances
-        for _ in range(self.config.edge):
-            body = _nearest_in_ring(body, scan.rings)
-        return self._own(scan.ranges, body)
+        if self._turn is None or not self._turn.same_shots(scan):
+            self._turn = _Turn(scan)
+        turn = self._turn
+        if turn.body is None or not np.array_equal(turn.T_base_lidar, scan.T_base_lidar):
+            turn.T_base_lidar = scan.T_base_lidar.copy()
+            hits = self._scene.cast(turn.bundle, scan.T_base_lidar, max_distance=3.0, min_distance=0.06)
+            turn.body = hits.distances
+            for _ in range(self.config.edge):
+                turn.body = turn.nearest_in_ring(turn.body)
+        return self._own(scan.ranges, turn.body)
 
     def camera_mask(self, frame: RgbdFrame, positions: Mapping[str, float]) -> Bool:
         """(H, W), True where a pixel shows the robot; pixels without reading are False.
@@ -104,10 +137,22 @@ class SelfFilter:
         posture = tuple(sorted((name, float(value)) for name, value in positions.items()))
         if posture == self._posture:
             return
-        for name, T_base_link in self.robot.forward(positions).items():
-            if name in self._links:
-                self._scene.set_pose(self._links[name], T_base_link)
         self._posture = posture
+        for name, T_base_link in self.robot.forward(positions).items():
+            if name in self._links and self._moved(name, T_base_link):
+                self._scene.set_pose(self._links[name], T_base_link)
+                self._placed[name] = T_base_link
+                if self._turn is not None:
+                    self._turn.body = None
+
+    def _moved(self, name: str, T_base_link: Float64) -> bool:
+        """Whether some point of a link may be farther than the tolerance from where it was placed."""
+        if name not in self._placed:
+            return True
+        change = T_base_link - self._placed[name]
+        turned, shifted = change[:3, :3].ravel(), change[:3, 3]
+        farthest = float(np.sqrt(turned @ turned)) * self._reach[name] + float(np.sqrt(shifted @ shifted))
+        return farthest > self.config.tolerance
 
     def _own(self, measured: np.ndarray, body: np.ndarray) -> Bool:
         margin = self.config.margin + self.config.relative * np.where(np.isfinite(body), body, 0.0)
@@ -119,13 +164,3 @@ def _nearest_around(image: np.ndarray) -> np.ndarray:
     padded = np.pad(image, 1, mode="edge")
     rows = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
     return np.minimum(np.minimum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
-
-
-def _nearest_in_ring(distances: Float32, rings: np.ndarray) -> Float32:
-    """Minimum over each shot and its neighbours in the same ring; rings are taken to be in order of time."""
-    order = np.argsort(rings, kind="stable")
-    line = distances[order]
-    padded = np.concatenate([line[:1], line, line[-1:]])
-    out = np.empty_like(distances)
-    out[order] = np.minimum(np.minimum(padded[:-2], line), padded[2:])
-    return out

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -66,8 +68,31 @@ def test_pixels_of_the_body_are_found_with_their_depth(body: SelfFilter) -> None
     assert not body.camera_mask(front, {"lift": 0.7}).any()
 
 
+def test_a_body_that_has_moved_is_seen_where_it_is(robot: KinematicTree) -> None:
+    """What is kept between scans is never older than the tolerance allows."""
+    kept, measured = SelfFilter(robot), scan(np.full(720, 2.0, np.float32))
+    for lift in (0.7, 0.7004, 0.699, 0.3, 0.0, 0.64, 0.7):
+        fresh = SelfFilter(robot)
+        assert np.array_equal(kept.lidar_mask(measured, {"lift": lift}), fresh.lidar_mask(measured, {"lift": lift}))
+    other = replace(measured, T_base_lidar=transform(translation=(0, 0, 0.1)))
+    assert np.array_equal(kept.lidar_mask(other, {"lift": 0.7}), SelfFilter(robot).lidar_mask(other, {"lift": 0.7}))
+    shorter = replace(
+        other,
+        directions=other.directions[::2],
+        ranges=other.ranges[::2],
+        times=other.times[::2],
+        rings=other.rings[::2],
+        intensities=other.intensities[::2],
+    )
+    mask = kept.lidar_mask(shorter, {"lift": 0.0})
+    assert mask.any()
+    assert np.array_equal(mask, SelfFilter(robot).lidar_mask(shorter, {"lift": 0.0}))
+
+
 def test_bad_settings_are_refused() -> None:
     with pytest.raises(InvalidValueError):
         SelfFilterConfig(margin=-1.0)
     with pytest.raises(InvalidValueError):
         SelfFilterConfig(stride=0)
+    with pytest.raises(InvalidValueError):
+        SelfFilterConfig(tolerance=-1e-3)
