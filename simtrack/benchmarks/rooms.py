@@ -115,6 +115,22 @@ def drive(world: Rooms, frames: int, step: float = 0.1) -> Float64:
     return poses
 
 
+def along_corridor(world: Rooms, frames: int, step: float = 0.1) -> Float64:
+    """(F, 3) positions on the floor of a drive east along the corridor in the middle; it ends where the corridor does.
+
+    Args:
+        world: the rooms.
+        frames: positions, less if the corridor ends before.
+        step: metres from one to the next.
+    """
+    regions = world.index.regions
+    start = 0.5 * (regions.low + regions.high)[world.middle] - (0.0, 0.0, 0.5 * HEIGHT)
+    length = regions.high[:, 0].max() - 0.5 * WIDTH - start[0]
+    out = np.tile(start, (min(frames, int(length / step) + 1), 1))
+    out[:, 0] += step * np.arange(len(out))
+    return out
+
+
 # ------------------------------------------------------------------------------------------------------- the floor plan
 
 

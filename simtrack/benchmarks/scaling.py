@@ -15,7 +15,7 @@ import numpy as np
 
 from simtrack.benchmarks import rooms
 from simtrack.benchmarks.harness import Benchmark, Options, Timing
-from simtrack.benchmarks.room_drive import PARTS, AllLive, PagedDrive, sensors
+from simtrack.benchmarks.room_drive import PARTS, T_BASE_LIDAR, AllLive, PagedDrive, sensors
 from simtrack.benchmarks.yardstick import REFERENCE, scaled, yardstick
 from simtrack.contracts import Float64
 from simtrack.objects import load_object
@@ -45,11 +45,13 @@ def run(options: Options) -> Benchmark:
         world = rooms.build(count, meshes, options.seed)
         timing = Timing(time.process_time() - cpu, time.perf_counter() - wall, 1)
         _report_world(result, world, timing, _resident() - before)
-        drives.append(PagedDrive(world, models, rooms.drive(world, 10 if options.quick else 300, _STEP)))
+        drives.append(PagedDrive(world, models, rooms.drive(world, 10 if options.quick else 400, _STEP)))
     _drive_in_turn(drives, options)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
     result.add("peak memory of the process, all worlds at once", value=peak, unit="GB", asked=4.0)
-    _report_drives(result, drives, REFERENCE if options.quick else yardstick(options.say))
+    pace = REFERENCE if options.quick else yardstick(options.say)
+    _report_drives(result, drives, pace)
+    _report_paging(result, drives[-1], 100 if options.quick else 4000, pace)
     _report_equality(result, next(d for d in drives if d.world.count == PAGED_ROOMS[0]), 3 if options.quick else 30)
     for drive in drives:
         drive.close()
@@ -91,18 +93,37 @@ def _report_drives(result: Benchmark, drives: Sequence[PagedDrive], pace: float)
     sizes = f"{large.world.objects:,}"
     ratio = float(np.median(large.frames / small.frames))
     result.add(f"frame, {sizes} : {small.world.objects:,} objects", value=ratio, unit="x", asked=1.5)
-    paging = 1e3 * np.array(large.cpu)[:, 0]
-    middle, p95, longest = np.percentile(paging, (50, 95, 100))
-    entered = np.count_nonzero(np.diff(large.world.index.regions.locate(large.poses[:, :3, 3])))
     live = f"{np.mean(large.live):.0f} instances live, {large.loaded} loaded"
-    note = f"median {middle:.2f}, p95 {p95:.2f}; {live}; {entered} rooms and corridors entered"
-    asked, name = scaled(20.0, pace), f"paging in any frame, at most, {sizes} objects"
-    result.add(name, value=float(longest), unit="ms", asked=asked, note=note)
+    entered = _entered(large.world, large.poses[:, :3, 3])
+    _add_paging(result, f"paging in any frame, {sizes} objects", np.array(large.cpu)[:, 0], pace, f"{live}; {entered}")
     result.notes.append(f"{np.mean(large.tracked):.1f} objects are registered in a frame on average.")
     result.series["paged.objects"] = [float(drive.world.objects) for drive in drives]
     result.series["paged.frame_ms"] = [1e3 * drive.frame.cpu for drive in drives]
     without_registration = [1e3 * np.array(drive.cpu)[:, :-1].sum(axis=1) for drive in drives]
     result.series["paged.casts_ms"] = [float(np.median(ms)) for ms in without_registration]
+
+
+def _report_paging(result: Benchmark, drive: PagedDrive, frames: int, pace: float) -> None:
+    """Paging alone, over hundreds of metres of corridor, doors on both sides."""
+    positions = rooms.along_corridor(drive.world, frames, _STEP)
+    seconds, loaded = np.empty(len(positions)), 0
+    drive.scene.require(positions[0] + T_BASE_LIDAR[:3, 3], drive.scene.config.reach, drive.scene.config.ahead)
+    for k, position in enumerate(positions):
+        start = time.process_time()
+        loaded += drive.scene.update(position + T_BASE_LIDAR[:3, 3]).loaded
+        seconds[k] = time.process_time() - start
+    note = f"{len(positions) * _STEP:.0f} m, {loaded} loaded; {_entered(drive.world, positions)}"
+    _add_paging(result, f"paging in any frame, {drive.world.objects:,} objects, along a corridor", seconds, pace, note)
+
+
+def _add_paging(result: Benchmark, name: str, seconds: Float64, pace: float, note: str) -> None:
+    middle, p95, longest = (float(value) for value in np.percentile(1e3 * seconds, (50, 95, 100)))
+    note = f"median {middle:.2f}, p95 {p95:.2f}; {note}"
+    result.add(f"{name}, at most", value=longest, unit="ms", asked=scaled(20.0, pace), note=note)
+
+
+def _entered(world: rooms.Rooms, positions: Float64) -> str:
+    return f"{np.count_nonzero(np.diff(world.index.regions.locate(positions)))} rooms and pieces of corridor entered"
 
 
 def _report_equality(result: Benchmark, drive: PagedDrive, frames: int) -> None:

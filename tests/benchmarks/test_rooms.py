@@ -110,6 +110,18 @@ def test_a_drive_goes_from_room_to_room_through_open_doors() -> None:
         assert a == b or tuple(sorted((a, b))) in sides
 
 
+def test_a_drive_along_the_corridor_stays_in_it_and_ends_with_it() -> None:
+    made = world(200)
+    positions = rooms.along_corridor(made, 10_000, step=0.25)
+    assert len(positions) < 10_000
+    np.testing.assert_allclose(np.diff(positions, axis=0), [[0.25, 0.0, 0.0]] * (len(positions) - 1), atol=1e-9)
+    visited = made.index.regions.locate(positions)
+    assert visited[0] == made.middle
+    assert (visited >= made.count).all()
+    assert visited[-1] == visited.max()
+    np.testing.assert_array_equal(rooms.along_corridor(made, 5, step=0.25), positions[:5])
+
+
 def test_wrong_worlds_are_refused() -> None:
     for count in (0, 1, 7, -2):
         with pytest.raises(InvalidValueError, match="even"):
