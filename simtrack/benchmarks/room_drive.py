@@ -51,6 +51,12 @@ def sensors() -> tuple[Sensor, Sensor]:
     return camera, Sensor(office.vlp16(), T_BASE_LIDAR, VLP16.max_range)
 
 
+def mounted(pair: tuple[Sensor, Sensor], T_map_base: Float64, number: int) -> tuple[Float64, Float64]:
+    """(4, 4) T_map_camera and T_map_lidar in a frame of a drive; the camera looks to and fro."""
+    pan = transform_planar(0.0, 0.0, _PAN * np.sin(2.0 * np.pi * number / _PAN_FRAMES))
+    return T_map_base @ pan @ pair[0].T_base_sensor, T_map_base @ pair[1].T_base_sensor
+
+
 @dataclass(eq=False)
 class PagedDrive:
     """A drive through a paged world, and what its frames took."""
@@ -90,9 +96,7 @@ class PagedDrive:
     def step(self, number: int, pair: tuple[Sensor, Sensor], keep: bool = True) -> None:
         """Go through one frame; `keep` its times."""
         camera, lidar = pair
-        pan = _PAN * np.sin(2.0 * np.pi * number / _PAN_FRAMES)
-        T_map_camera = self.poses[number] @ transform_planar(0.0, 0.0, pan) @ camera.T_base_sensor
-        T_map_lidar = self.poses[number] @ lidar.T_base_sensor
+        T_map_camera, T_map_lidar = mounted(pair, self.poses[number], number)
         wall, cpu = -time.perf_counter(), [time.process_time()]
         loaded = self.scene.update(T_map_lidar[:3, 3]).loaded
         cpu.append(time.process_time())
@@ -168,9 +172,10 @@ class AllLive:
         """Instances that a world takes."""
         return len(world.index) + int(np.count_nonzero(~world.index.regions.is_open))
 
-    def cast(self, pose: Float64, pair: Sequence[Sensor]) -> list[RayHits]:
-        """What each sensor meets from a pose T_map_base (4, 4)."""
-        return [self.scene.cast(s.bundle, pose @ s.T_base_sensor, s.reach, out=s.out) for s in pair]
+    def cast(self, pair: tuple[Sensor, Sensor], T_map_base: Float64, number: int) -> list[RayHits]:
+        """What camera and lidar meet in a frame of a drive."""
+        poses = mounted(pair, T_map_base, number)
+        return [self.scene.cast(s.bundle, T, s.reach, out=s.out) for s, T in zip(pair, poses, strict=True)]
 
     def differing(self, paged: PagedHits, live: RayHits) -> tuple[int, int]:
         """Rays that met another object, or farther off than 1e-6 of the distance; and others that met another face.
