@@ -1,7 +1,7 @@
 """What a run leaves in memory for its report: plain data, bounded, with no reference to the simulation."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,7 +37,7 @@ class KeyFrame:
     T_map_camera: Float64
     """(4, 4), believed."""
     tracks: tuple[Track, ...]
-    relations: Set[Relation]
+    relations: frozenset[Relation]
     objects: tuple[ObjectFrame, ...]
     """Truth and errors at the stamp."""
 
@@ -231,8 +231,8 @@ def encode_jpeg(rgb: np.ndarray, quality: int = 88) -> bytes:
 def _key_frame(frame: RgbdFrame, belief: Belief, objects: tuple[ObjectFrame, ...]) -> KeyFrame:
     assert frame.rgb is not None
     return KeyFrame(
-        frame.stamp, encode_jpeg(frame.rgb), frame.intrinsics, belief.T_map_camera, belief.tracks, belief.relations,
-        objects,
+        frame.stamp, encode_jpeg(frame.rgb), frame.intrinsics, belief.T_map_camera, belief.tracks,
+        frozenset(belief.relations), objects,
     )  # fmt: skip
 
 

@@ -70,10 +70,12 @@ class BodyArrays:
         self.set_poses(np.array([slot]), np.asarray(T_map, dtype=float)[None])
         return slot
 
-    def set_poses(self, slots: np.ndarray, T_map: Float64) -> None:
-        """Move slots (S,) to poses (S, 4, 4)."""
+    def set_poses(self, slots: np.ndarray, T_map: Float64) -> Float64:
+        """Move slots (S,) to poses (S, 4, 4); returns by how many metres the centres moved (S,)."""
+        shift = np.sqrt(((T_map[:, :3, 3] - self.world.centres[slots]) ** 2).sum(axis=1))
         self.world.centres[slots] = T_map[:, :3, 3]
         self.world.rotations[slots] = T_map[:, :3, :3]
+        return shift
 
     def remove(self, slot: int) -> None:
         """Free a slot."""
@@ -130,32 +132,24 @@ def _range(heights: Float64) -> tuple[float, float, int]:
     return (float(surface.min()), float(surface.max()), len(surface)) if len(surface) else (0.0, 0.0, 0)
 
 
-_PER_SLOT = (
-    "centres",
-    "rotations",
-    "halves",
-    "interior_centres",
-    "interior_halves",
-    "layout",
-    "reach",
-    "radii",
-    "fields",
-    "supports",
-)
+_PER_SLOT: Mapping[str, tuple[type, tuple[int, ...]]] = {
+    "centres": (np.float64, (3,)),
+    "rotations": (np.float64, (3, 3)),
+    "halves": (np.float64, (3,)),
+    "interior_centres": (np.float64, (3,)),
+    "interior_halves": (np.float64, (3,)),
+    "layout": (np.bool_, ()),
+    "reach": (np.float64, ()),
+    "radii": (np.float64, ()),
+    "fields": (np.int32, (6,)),
+    "supports": (np.int32, (2,)),
+}
+"""Those arrays of `World` that have a row a slot: their type, and the shape of a row."""
 
 
 def _empty_world(capacity: int) -> World:
     return World(
-        centres=np.zeros((capacity, 3)),
-        rotations=np.zeros((capacity, 3, 3)),
-        halves=np.zeros((capacity, 3)),
-        interior_centres=np.zeros((capacity, 3)),
-        interior_halves=np.zeros((capacity, 3)),
-        layout=np.zeros(capacity, dtype=np.bool_),
-        reach=np.zeros(capacity),
-        radii=np.zeros(capacity),
-        fields=np.zeros((capacity, 6), dtype=np.int32),
-        supports=np.zeros((capacity, 2), dtype=np.int32),
+        **{name: np.zeros((capacity, *shape), dtype=kind) for name, (kind, shape) in _PER_SLOT.items()},
         field_rotations=np.zeros((0, 3, 3)),
         field_origins=np.zeros((0, 3)),
         field_sizes=np.zeros((0, 2)),

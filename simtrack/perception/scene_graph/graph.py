@@ -19,7 +19,7 @@ from simtrack.perception.scene_graph import kernels
 from simtrack.perception.scene_graph.bodies import Body, BodyArrays
 from simtrack.perception.scene_graph.facts import Entity, Layer, SceneFacts
 from simtrack.perception.scene_graph.history import History
-from simtrack.perception.scene_graph.motion import NONE, Motion
+from simtrack.perception.scene_graph.motion import NONE, Motion, stacked
 from simtrack.perception.scene_graph.pairs import PairTable
 from simtrack.perception.scene_graph.relations import RELATIONS, RelationConfig
 from simtrack.perception.scene_graph.rooms import RoomIndex
@@ -84,6 +84,7 @@ class SceneGraph(SceneFacts):
         self._arrays = BodyArrays({f"model:{name}": shape for name, shape in self._model_shapes.items()}, rules)
         capacity = len(self._arrays.alive)
         self._pairs = PairTable()
+        self._parameters = rules.parameters()
         self._motion = Motion(
             capacity,
             move=(self.config.move_translation, self.config.move_rotation),
@@ -96,6 +97,7 @@ class SceneGraph(SceneFacts):
         self._tracks: dict[str, dict[int, int]] = {name: {} for name in models}
         self._keys: dict[int, tuple[str, int]] = {}
         self._last_keys: tuple[list[str], list[int]] = [], []
+        """Classes and numbers of the tracks of the last frame; their slots need not be looked up again."""
         self._last_slots = np.zeros(0, dtype=np.int64)
         self._near_below: dict[int, set[int]] = {}
         self._near_above: dict[int, set[int]] = {}
@@ -124,47 +126,48 @@ class SceneGraph(SceneFacts):
             self.status = Status.STALE
             return self.relations
         believed = [track for track in tracks if track.status in BELIEVED]
-        slots = self._find(believed)
-        poses = np.concatenate([track.T_map_object for track in believed] or [np.zeros((0, 4))]).reshape(-1, 4, 4)
+        keys = [track.class_name for track in believed], [track.id for track in believed]
+        poses = stacked([track.T_map_object for track in believed])
         observed = np.array([track.last_seen >= track.stamp for track in believed], dtype=np.bool_)
+        same = keys == self._last_keys
+        slots = self._last_slots if same else self._find(keys)
         self.stamp = stamp
-        self._table = None
         self.status = Status.OK
+        self._table = None
+        self._last_keys = [], []
 
-        self._retire(stamp, slots)
+        if not same:
+            self._retire(stamp, slots)
         if not np.isfinite(poses).all():
             self.status = Status.DEGRADED
             finite = np.all(np.isfinite(poses.reshape(-1, 16)), axis=1)
             believed = list(compress(believed, finite))
             slots, poses, observed = slots[finite], poses[finite], observed[finite]
-        self._admit(believed, slots, poses)
-        self._motion.place(slots, poses, observed)
-        self._relate(stamp, self._motion.moved(slots))
+        if not same:
+            self._admit(believed, slots, poses)
+        self._relate(stamp, self._motion.place(slots, poses, observed))
         self._motion.remember(slots, observed, self._parent)
+        if self.status is Status.OK:
+            self._last_keys, self._last_slots = keys, slots
         return self.relations
 
-    def _find(self, tracks: Sequence[Track]) -> np.ndarray:
-        """Slots of the tracks, NONE for new ones; those of the last frame if it had the same tracks."""
-        keys = [track.class_name for track in tracks], [track.id for track in tracks]
-        if keys != self._last_keys:
-            try:
-                found = [self._tracks[name].get(number, NONE) for name, number in zip(*keys, strict=True)]
-            except KeyError as error:
-                raise UnknownNameError("object model", str(error.args[0]), self._tracks) from None
-            self._last_keys, self._last_slots = keys, np.array(found, dtype=np.int64)
-        return self._last_slots
+    def _find(self, keys: tuple[list[str], list[int]]) -> np.ndarray:
+        """Slots of tracks given by their classes and numbers, NONE for new ones."""
+        try:
+            found = [self._tracks[name].get(number, NONE) for name, number in zip(*keys, strict=True)]
+        except KeyError as error:
+            raise UnknownNameError("object model", str(error.args[0]), self._tracks) from None
+        return np.array(found, dtype=np.int64)
 
     def _retire(self, stamp: int, slots: np.ndarray) -> None:
         """Take out the tracks that are not among those in `slots` any more."""
-        gone = self._tracked.copy()
-        gone[slots[slots != NONE]] = False
-        if not gone.any():
+        gone = np.setdiff1d(np.nonzero(self._tracked)[0], slots)
+        if not len(gone):
             return
-        left = np.nonzero(gone)[0]
         self._apply(stamp, self._pairs.drop(self._arrays.world, np.nonzero(self._arrays.alive)[0], gone))
-        self._motion.leave(left)
-        self._tracked[left] = False
-        for slot in left.tolist():
+        self._motion.leave(gone)
+        self._tracked[gone] = False
+        for slot in gone.tolist():
             self._enter_room(stamp, slot, NONE)
             self._parent[slot] = NONE
             self._arrays.remove(slot)
@@ -189,15 +192,10 @@ class SceneGraph(SceneFacts):
         """Evaluate the pairs of the slots that moved."""
         if not len(moved):
             return
-        poses = self._motion.T[moved]
-        shift = np.zeros(len(self._arrays.alive))
-        shift[moved] = np.linalg.norm(poses[:, :3, 3] - self._arrays.world.centres[moved], axis=1)
-        self._arrays.set_poses(moved, poses)
+        world, alive = self._arrays.world, self._arrays.alive
+        shift = self._arrays.set_poses(moved, self._motion.T[moved])
         self._motion.evaluated(moved)
-        flags = np.zeros(len(self._arrays.alive), dtype=np.bool_)
-        flags[moved] = True
-        slots, parameters = np.nonzero(self._arrays.alive)[0], self.relation_config.parameters()
-        self._apply(stamp, self._pairs.update(self._arrays.world, slots, flags, shift, parameters))
+        self._apply(stamp, self._pairs.update(world, np.nonzero(alive)[0], moved, shift, self._parameters))
         self._assign_rooms(stamp, moved)
 
     # ------------------------------------------------------------------------------------------------------ relations

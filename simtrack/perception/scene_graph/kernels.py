@@ -196,12 +196,25 @@ def _smallest(values, rank):
 
 
 @njit(cache=True, nogil=True)
-def _span(world, field, R, t, axis):
-    """Least and largest coordinate of a field's surface along an axis of the frame in which its pose is R, t."""
-    slack = 0.5 * (abs(R[axis, 0]) * world.field_sizes[field, 0] + abs(R[axis, 1]) * world.field_sizes[field, 1])
-    low = t[axis] + R[axis, 2] * world.field_ranges[field, 0]
-    high = t[axis] + R[axis, 2] * world.field_ranges[field, 1]
+def _span(world, field, R, t):
+    """Least and largest height of a field's surface in the field in which its pose is R, t."""
+    slack = 0.5 * (abs(R[2, 0]) * world.field_sizes[field, 0] + abs(R[2, 1]) * world.field_sizes[field, 1])
+    low = t[2] + R[2, 2] * world.field_ranges[field, 0]
+    high = t[2] + R[2, 2] * world.field_ranges[field, 1]
     return min(low, high) - slack, max(low, high) + slack
+
+
+@njit(cache=True, nogil=True)
+def _window(R, t, axis, width, depth, low, high, step, count):
+    """First and one past the last of a field's cells along an axis that can lie over a rectangle of another field.
+
+    R and t are the pose of the field in the other one, `low` and `high` the heights of its cells there.
+    """
+    middle = -R[0, axis] * t[0] - R[1, axis] * t[1] + R[2, axis] * (0.5 * (low + high) - t[2])
+    half = 0.5 * (abs(R[0, axis]) * width + abs(R[1, axis]) * depth + abs(R[2, axis]) * (high - low))
+    first = np.floor((middle - half) / step + 0.5 * count - 0.5)
+    last = np.ceil((middle + half) / step + 0.5 * count + 0.5)
+    return int(min(max(first, 0.0), count)), int(min(max(last, 0.0), count))
 
 
 @njit(cache=True, nogil=True)
@@ -224,13 +237,12 @@ def _contact_gap(world, body, field, other, first, count):
         ev = world.field_sizes[g, 1] / mv
         area += world.field_ranges[g, 2] * eu * ev
         _relative_pose(world, other, g, body, field, R, t)
-        low_x, high_x = _span(world, field, R, t, 0)
-        low_y, high_y = _span(world, field, R, t, 1)
-        if max(low_x, -high_x) > 0.5 * mu * eu or max(low_y, -high_y) > 0.5 * mv * ev:
-            continue
-        for i in range(nu):
+        low, high = _span(world, field, R, t)
+        i0, i1 = _window(R, t, 0, mu * eu, mv * ev, low, high, du, nu)
+        j0, j1 = _window(R, t, 1, mu * eu, mv * ev, low, high, dv, nv)
+        for i in range(i0, i1):
             x = (i + 0.5 - 0.5 * nu) * du
-            for j in range(nv):
+            for j in range(j0, j1):
                 cell = i * nv + j
                 z = heights[start + cell]
                 if z == -np.inf:
@@ -280,7 +292,7 @@ def _clearance_bound(world, a, b):
             else:
                 body, field, other, surface = b, g, a, lower
             _relative_pose(world, other, surface, body, field, R, t)
-            low, high = _span(world, field, R, t, 2)
+            low, high = _span(world, field, R, t)
             bound = min(bound, max(low - world.field_ranges[surface, 1], world.field_ranges[surface, 0] - high))
     return bound
 
@@ -370,13 +382,8 @@ def box_distance(world, a, b, parameters, limit):
     cj, Rj, hj = world.centres[j], world.rotations[j], world.halves[j]
     if limit == np.inf:
         return signed_distance(ci, Ri, hi, cj, Rj, hj, np.inf)
-    far = parameters.near_range + limit
-    gap = np.sqrt((ci[0] - cj[0]) ** 2 + (ci[1] - cj[1]) ** 2 + (ci[2] - cj[2]) ** 2)
-    gap -= world.radii[i] + world.radii[j]
-    if gap > far:
-        return gap
     gap = separation(ci, Ri, hi, cj, Rj, hj)
-    if gap <= 0.0 or gap > far:
+    if gap <= 0.0 or gap > parameters.near_range + limit:
         return gap
     upper = corner_distance(ci, Ri, hi, cj, Rj, hj)
     for threshold in (0.0, parameters.touch_distance, parameters.on_distance, parameters.near_range):

@@ -4,6 +4,9 @@ T_supporter_child = T_map_supporter^-1 T_map_child is kept from when the child w
 T_map_child = T_map_supporter T_supporter_child holds since then: T_m^c = T_m^t T_t^c of the tracking paper (III.D).
 """
 
+from collections.abc import Sequence
+from contextlib import suppress
+
 import numpy as np
 from numba import njit
 
@@ -55,13 +58,13 @@ class Motion:
         self._supporter[slots] = NONE
         self.carried[slots] = False
 
-    def place(self, slots: np.ndarray, T_map: Float64, observed: Bool) -> None:
-        """Take the poses (S, 4, 4) of slots (S,), and those of supporters that moved for what was not `observed`."""
+    def place(self, slots: np.ndarray, T_map: Float64, observed: Bool) -> np.ndarray:
+        """Take the poses (S, 4, 4) of slots (S,), and those of supporters that moved for what was not `observed`.
+
+        Returns those of the slots whose pose is now another than the one last evaluated.
+        """
         _place(slots, T_map, observed, self._supporter, self.T, self._T_seen, self._T_supporter_seen, self.carried,
                self._carry)  # fmt: skip
-
-    def moved(self, slots: np.ndarray) -> np.ndarray:
-        """Those of the slots (S,) whose pose is another than the one last evaluated."""
         return slots[_moved(slots, self.T, self._T_evaluated, self._move)]
 
     def evaluated(self, slots: np.ndarray) -> None:
@@ -78,6 +81,18 @@ class Motion:
         if supporter < 0:
             return None
         return self.T[supporter] @ inverse(self._T_supporter_seen[slot]) @ self._T_seen[slot]
+
+
+def stacked(poses: Sequence[Float64]) -> Float64:
+    """(N, 4, 4) array of N poses.
+
+    To join their bytes takes half the time of numpy's ways; where these are no rows of float64, numpy does it.
+    """
+    with suppress(TypeError, ValueError):
+        joined = np.frombuffer(b"".join(poses))  # pyright: ignore[reportArgumentType]
+        if len(joined) == 16 * len(poses) and (joined[15::16] == 1.0).all():
+            return joined.reshape(-1, 4, 4)
+    return np.array(poses, dtype=float).reshape(-1, 4, 4)
 
 
 def _squares(shift: float, turn: float) -> tuple[float, float]:

@@ -7,7 +7,7 @@ reading the tracks of a frame does, so that an index would not pay before many t
 import numpy as np
 from numba import njit
 
-from simtrack.contracts import Bool, Float64
+from simtrack.contracts import Float64
 from simtrack.perception.scene_graph.kernels import COUNT, Parameters, World, box_distance, pair_margins
 
 _FREE = -1
@@ -30,15 +30,15 @@ class PairTable:
         self._used = 0
 
     def update(
-        self, world: World, slots: np.ndarray, moved: Bool, shift: Float64, parameters: Parameters
+        self, world: World, slots: np.ndarray, moved: np.ndarray, shift: Float64, parameters: Parameters
     ) -> np.ndarray:
         """Evaluate the pairs of what moved.
 
         Args:
             world: bodies at their present poses.
             slots: (S,) slots in use.
-            moved: (C,), by slot.
-            shift: (C,) metres that centres moved since the last evaluation.
+            moved: (M,) slots of them.
+            shift: (M,) metres by which their centres moved since the last evaluation.
             parameters: the thresholds.
 
         Returns:
@@ -46,8 +46,8 @@ class PairTable:
         """
         return self._renew(world, _neighbours(world, slots, moved, shift), parameters)
 
-    def drop(self, world: World, slots: np.ndarray, gone: Bool) -> np.ndarray:
-        """Forget all pairs of the slots that are `gone` (C,), among `slots` (S,); returns changes as `update` does."""
+    def drop(self, world: World, slots: np.ndarray, gone: np.ndarray) -> np.ndarray:
+        """Forget all pairs of `gone` (M,) among the `slots` (S,) in use; returns changes as `update` does."""
         pairs = _neighbours(world, slots, gone, np.zeros(len(gone)))
         return _clear(pairs, self._keys, self._masks)
 
@@ -90,28 +90,27 @@ def _insert(new_keys, new_masks, keys, masks):
 
 
 @njit(cache=True, nogil=True)
-def _in_reach(centres, i, j, span):
-    square = 0.0
-    for k in range(3):
-        square += (centres[i, k] - centres[j, k]) ** 2
-    return square <= span * span
-
-
-@njit(cache=True, nogil=True)
 def _neighbours(world, slots, moved, shift):
     """(P, 2) pairs of slots, each once, one of them moved: all that may be related now or may have been before."""
-    centres, reach, radii = world.centres, world.reach, world.radii
+    spheres = np.empty((moved.shape[0], 5))
+    shifts = np.full(world.centres.shape[0], -1.0)
+    for row in range(moved.shape[0]):
+        i = moved[row]
+        spheres[row, :3] = world.centres[i]
+        spheres[row, 3] = world.reach[i] + shift[row]
+        spheres[row, 4] = world.radii[i] + shift[row]
+        shifts[i] = shift[row]
     pairs = np.empty((256, 2), np.int64)
     count = 0
-    for i in slots:
-        if not moved[i]:
-            continue
-        x, y, z = centres[i, 0], centres[i, 1], centres[i, 2]
-        for j in slots:
-            span = max(reach[i] + radii[j], reach[j] + radii[i]) + shift[i] + shift[j]
-            if (centres[j, 0] - x) ** 2 + (centres[j, 1] - y) ** 2 + (centres[j, 2] - z) ** 2 > span * span:
-                continue
-            if i == j or (moved[j] and j < i):
+    for j in slots:
+        x, y, z = world.centres[j, 0], world.centres[j, 1], world.centres[j, 2]
+        extra = max(shifts[j], 0.0)
+        reach, radius = world.reach[j] + extra, world.radii[j] + extra
+        for row in range(moved.shape[0]):
+            span = max(spheres[row, 3] + radius, spheres[row, 4] + reach)
+            square = (spheres[row, 0] - x) ** 2 + (spheres[row, 1] - y) ** 2 + (spheres[row, 2] - z) ** 2
+            i = moved[row]
+            if square > span * span or i == j or (shifts[j] >= 0.0 and j < i):
                 continue
             if count == pairs.shape[0]:
                 longer = np.empty((2 * count, 2), np.int64)
@@ -134,11 +133,18 @@ def _evaluate(world, pairs, keys, masks, parameters):
     t = np.empty(3)
     e = np.empty(3)
     limit = max(parameters.leave_margin, parameters.enter_margin)
+    far = parameters.near_range + limit
     for row in range(pairs.shape[0]):
         i = pairs[row, 0]
         j = pairs[row, 1]
-        near = _in_reach(centres, i, j, max(reach[i] + radii[j], reach[j] + radii[i]))
-        distance = box_distance(world, i, j, parameters, limit) if near else np.inf
+        square = 0.0
+        for k in range(3):
+            square += (centres[i, k] - centres[j, k]) ** 2
+        apart = np.sqrt(square)
+        near = apart <= max(reach[i] + radii[j], reach[j] + radii[i])
+        distance = apart - radii[i] - radii[j]
+        if distance <= far:
+            distance = box_distance(world, i, j, parameters, limit)
         for turn in range(2):
             a, b = (i, j) if turn == 0 else (j, i)
             place = _find(keys, a, b)

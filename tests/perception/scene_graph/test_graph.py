@@ -17,6 +17,7 @@ from simtrack.perception.scene_graph import (
     SceneGraphConfig,
     model_shape,
 )
+from simtrack.perception.scene_graph.motion import stacked
 
 Models = dict[str, ModelLike]
 TrackMaker = Callable[..., Track]
@@ -180,6 +181,16 @@ def test_a_carried_child_stays_where_its_supporter_vanished(graph: SceneGraph, t
     graph.update(3, [track("relay", 2, T_relay, 3, seen=False)])
     expected = T_far @ inverse(on_bench(TRAY)) @ T_relay
     np.testing.assert_allclose(graph.entity("relay-2").T_map, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_poses_of_any_kind_are_stacked(kind: type, order: str) -> None:
+    poses = [np.asarray(transform(None, (n, 2.0, 3.0)), dtype=kind, order=order) for n in range(3)]  # type: ignore[call-overload]
+    for chosen in (poses, [*poses, np.full((4, 4), np.nan)], []):
+        result = stacked(chosen)
+        assert result.dtype == np.float64
+        np.testing.assert_array_equal(result, np.array(chosen).reshape(-1, 4, 4))
 
 
 # ---------------------------------------------------------------------------------------------------------- live update

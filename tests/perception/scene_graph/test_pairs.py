@@ -42,18 +42,11 @@ class Crowd:
         self.masks: dict[tuple[int, int], int] = {}
 
     def update(self, moved: np.ndarray, T_map: Float64) -> None:
-        before = self.arrays.world.centres.copy()
-        self.arrays.set_poses(moved, T_map)
-        flags = np.zeros(len(self.arrays.alive), dtype=np.bool_)
-        flags[moved] = True
-        shift = np.linalg.norm(self.arrays.world.centres - before, axis=1)
-        parameters = self.config.parameters()
-        self.apply(self.table.update(self.arrays.world, self.slots, flags, shift, parameters))
+        shift = self.arrays.set_poses(moved, T_map)
+        self.apply(self.table.update(self.arrays.world, self.slots, moved, shift, self.config.parameters()))
 
     def drop(self, gone: np.ndarray) -> None:
-        flags = np.zeros(len(self.arrays.alive), dtype=np.bool_)
-        flags[gone] = True
-        self.apply(self.table.drop(self.arrays.world, self.slots, flags))
+        self.apply(self.table.drop(self.arrays.world, self.slots, gone))
         self.slots = np.setdiff1d(self.slots, gone)
 
     def apply(self, changes: np.ndarray) -> None:
