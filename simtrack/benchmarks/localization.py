@@ -50,13 +50,15 @@ def run(options: Options) -> Benchmark:
     shots = site.measured()
     rng = np.random.default_rng(options.seed)
     starts = [_start(site.T_map_base, rng) for _ in range(2 if options.quick else 12)]
-    asked = None if options.quick else scaled(ASKED_TIME, yardstick(options.say))
     repeats = 3 if options.quick else 21
 
     options.say("convergence")
     _convergence(result, site, shots, starts)
-    options.say("corrections, and peers")
-    _time(result, site, shots, starts, asked, repeats, options.threads)
+    asked = None if options.quick else scaled(ASKED_TIME, yardstick(options.say))
+    options.say("corrections")
+    _corrections(result, site, shots, starts[0], asked, repeats)
+    options.say("peers")
+    _peers(result, site, shots, starts, repeats, options.threads)
     options.say("a drive")
     _drive(result, site, 5 if options.quick else 60, rng)
     result.notes.append(
@@ -213,44 +215,44 @@ def _plot(series: dict[str, list[float]], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-# ----------------------------------------------------------------------------------------------------- time, and peers
+# ---------------------------------------------------------------------------------------------- corrections, and peers
 
 
-def _time(
-    result: Benchmark,
-    site: Site,
-    shots: Measurement,
-    starts: list[Float64],
-    asked: float | None,
-    repeats: int,
-    threads: int,
+def _corrected(site: Site, shots: Measurement, T: Float64, strides: tuple[int, ...]) -> Registration:
+    return register(shots, site.surface, T, _PRIOR, RegistrationConfig(), strides=strides)
+
+
+def _corrections(
+    result: Benchmark, site: Site, shots: Measurement, start: Float64, asked: float | None, repeats: int
 ) -> None:
-    """Times from the first start; final errors over all starts."""
-    config, start = RegistrationConfig(), starts[0]
-
-    def corrected(T: Float64, strides: tuple[int, ...]) -> Registration:
-        return register(shots, site.surface, T, _PRIOR, config, strides=strides)
-
-    peers: dict[str, Callable[[Float64], Float64]] = {"simtrack": lambda T: corrected(T, config.strides).T_map_base}
-    for name, prepare in (("small_gicp", _small_gicp), ("Open3D", _open3d)):
-        try:
-            peers |= prepare(site.surface.static_map, shots.points, threads)
-        except ImportError:
-            result.notes.append(f"{name} is not installed (extra bench): no comparison with it.")
     contestants: dict[str, Callable[[], object]] = {
-        "one": lambda: corrected(start, (1,)),
-        "cast": lambda: site.surface.cast(start, shots),
-        "half": lambda: corrected(start, (2,)),
+        "all": lambda: _corrected(site, shots, start, (1,)),
+        "cast": lambda: site.surface.cast(start, shots, reach=np.inf),
+        "half": lambda: _corrected(site, shots, start, (2,)),
     }
-    contestants |= {name: partial(align, start) for name, align in peers.items()}
     timings = measure(contestants, repeats)
-    steps = corrected(start, (1,)).steps
-    result.add(
-        f"correction, {len(shots):,} rays, {steps} steps", timings["one"], asked=asked, note="one cast, all rays"
-    )
+    steps = _corrected(site, shots, start, (1,)).steps
+    name = f"correction, {len(shots):,} rays, {steps} steps"
+    result.add(name, timings["all"], asked=asked, note="one cast, all rays")
     result.add("correction: of which casting", timings["cast"])
     result.add("correction on half of the rays", timings["half"], note="as the localizer's last iteration")
-    for name, align in peers.items():
+
+
+def _peers(
+    result: Benchmark, site: Site, shots: Measurement, starts: list[Float64], repeats: int, threads: int
+) -> None:
+    """Times from the first start; final errors over all starts."""
+    strides = RegistrationConfig().strides
+    aligners: dict[str, Callable[[Float64], Float64]] = {
+        "simtrack": lambda T: _corrected(site, shots, T, strides).T_map_base
+    }
+    for name, prepare in (("small_gicp", _small_gicp), ("Open3D", _open3d)):
+        try:
+            aligners |= prepare(site.surface.static_map, shots.points, threads)
+        except ImportError:
+            result.notes.append(f"{name} is not installed (extra bench): no comparison with it.")
+    timings = measure({name: partial(align, starts[0]) for name, align in aligners.items()}, repeats)
+    for name, align in aligners.items():
         final = [site.errors(align(T)) for T in starts]
         millimetres, degrees = np.median(final, axis=0)
         note = f"median error {millimetres:.2g} mm, {degrees:.2g} deg"

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from simtrack.contracts import Float64
-from simtrack.geometry.transforms import difference, orthonormal
 from simtrack.perception.localization.assessment import Assessment, assess, judge
 from simtrack.perception.localization.config import RegistrationConfig
 from simtrack.perception.localization.measurement import Measurement
@@ -69,47 +68,38 @@ def register(
         strides: thinning of the shots, one entry a ray-casting iteration; the config's if None.
         assessed: judge the pose too, by the last cast if the pose moved little since.
     """
-    from simtrack.perception.localization.solver import descend, map_information
+    from simtrack.perception.localization.solver import descend, posterior
 
     T = np.array(T_prior if T_start is None else T_start, dtype=np.float64)
     T_prior = np.ascontiguousarray(T_prior, dtype=np.float64)
-    prior = np.linalg.inv(covariance + 1e-14 * np.eye(6))
+    prior, upright = np.linalg.inv(covariance + 1e-14 * np.eye(6)), floor_information(config)
+    own = np.diag([config.systematic_sigma**2] * 3 + [config.systematic_angle**2] * 3)
+    own = own if systematic is None else own + systematic
     reach = float(np.median(measurement.ranges[::8])) if len(measurement) else 0.0
     gate = _clip_gate(3.0 * _spread(covariance, reach), config)
-    upright = floor_information(config)
     strides = config.strides if strides is None else strides
-    info, map_info = np.zeros((6, 6)), np.zeros((6, 6))
-    basis = dual = np.zeros((6, 0))
-    count, residual, steps, moved = 0, 0.0, 0, 0.0
     assessment: Assessment | None = None
-    turn = 0
+    found, count, steps, turn = None, 0, 0, 0
+    fused = _symmetric(np.linalg.inv(prior + upright))
     while turn < len(strides):
-        last = turn == len(strides) - 1
-        view = surface.cast(T, measurement, strides[turn], reach=max(2.0 * PASSED_OVER, 6.0 * gate))
+        view = surface.cast(T, measurement, strides[turn], _second_surfaces(gate))
         pairs, count = surface.pair(T, view, gate, config.pointing_sigma)
         if count < config.min_correspondences:
             break
-        T_cast, rules = T, _rules(config, reach, gate)
-        T, info, basis, dual, residual, kernel, taken = descend(
-            T_cast, pairs, count, T_prior, prior, upright, surface.floor, rules
-        )
-        T[:3, :3] = orthonormal(T[:3, :3])
-        steps += taken
-        change = difference(T, T_cast)
-        moved = float(np.linalg.norm(change[:3])) + reach * float(np.linalg.norm(change[3:]))
-        gate = _clip_gate(2.0 * moved + 3.0 * residual, config, ceiling=gate)
+        T_cast, last = T, turn == len(strides) - 1
+        found = descend(T_cast, pairs, count, T_prior, prior, upright, surface.floor, _rules(config, reach, gate))
+        T, steps = found.T, steps + found.steps
         if last:
-            map_info = map_information(pairs, count, T_cast, T, kernel)
-            assessment = judge(view) if assessed and moved < config.settled else None
-        turn = len(strides) - 1 if moved < config.settled and not last else turn + 1
-    fused = _symmetric(np.linalg.inv(prior + upright + info))
-    if count >= config.min_correspondences:
-        own = np.diag([config.systematic_sigma**2] * 3 + [config.systematic_angle**2] * 3)
-        fused = _keep_shared_error(fused, map_info, basis, dual, own if systematic is None else own + systematic)
-    converged = count >= config.min_correspondences and moved < 0.5 * config.min_gate
+            fused = posterior(T_cast, pairs, count, found, prior + upright, own)
+            assessment = judge(view) if assessed and found.moved < config.settled else None
+        gate = _clip_gate(2.0 * found.moved + 3.0 * found.residual, config, ceiling=gate)
+        turn = len(strides) - 1 if found.moved < config.settled and not last else turn + 1
     if assessed and assessment is None:
         assessment = assess(measurement.thinned(7), surface, T)
-    return Registration(T, _symmetric(fused), converged, count, residual, basis.shape[1], steps, assessment)
+    if found is None or turn < len(strides):
+        return Registration(T, fused, False, count, 0.0, 0, steps, assessment)
+    converged = found.moved < 0.5 * config.min_gate
+    return Registration(T, fused, converged, count, found.residual, found.basis.shape[1], steps, assessment)
 
 
 def _rules(config: RegistrationConfig, reach: float, gate: float) -> "Rules":
@@ -131,29 +121,9 @@ def floor_information(config: RegistrationConfig) -> Float64:
     return np.diag([0.0, 0.0, config.floor_sigma**-2, config.tilt_sigma**-2, config.tilt_sigma**-2, 0.0])
 
 
-def floor_deviation(T_map_base: Float64, floor: float) -> Float64:
-    """(6,) deviation from standing upright at height `floor`.
-
-    The tilt is ``e_z x (R e_z)``, whose derivative by a left rotation is the identity about x and y near upright.
-    """
-    return np.array([0.0, 0.0, T_map_base[2, 3] - floor, -T_map_base[1, 2], T_map_base[0, 2], 0.0])
-
-
-def _keep_shared_error(covariance: Float64, map_info: Float64, basis: Float64, dual: Float64, own: Float64) -> Float64:
-    """Covariance that is nowhere below what the errors leave that no averaging removes.
-
-    The map's error is the same in every scan from about the same place, and the systematic ones (`own`) in every shot:
-    the filter must not average them away. `basis` and `dual` are (6, K), see `solver.observable`.
-    """
-    count = basis.shape[1]
-    if not count:
-        return covariance
-    limit = np.linalg.inv(basis.T @ map_info @ basis + 1e-9 * np.eye(count)) + dual.T @ own @ dual
-    root = np.asarray(np.linalg.cholesky(_symmetric(limit)), dtype=np.float64)
-    inverse_root = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(_symmetric(inverse_root @ dual.T @ covariance @ dual @ inverse_root.T))
-    lift = basis @ root @ vectors
-    return covariance + (lift * np.maximum(1.0 - values, 0.0)) @ lift.T
+def _second_surfaces(gate: float) -> float:
+    """Metres by which a shot must reach through a surface to be sought behind it; none is while the pose is vague."""
+    return max(2.0 * PASSED_OVER, 6.0 * gate) if gate <= PASSED_OVER else np.inf
 
 
 def _spread(covariance: Float64, reach: float) -> float:

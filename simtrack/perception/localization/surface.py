@@ -45,8 +45,8 @@ class _Room:
     """Arrays for a number of rays that casts use again and again."""
 
     def __init__(self, capacity: int) -> None:
+        from simtrack.perception.localization.correspondences import ROWS
         from simtrack.perception.localization.kernels import Follow
-        from simtrack.perception.localization.solver import ROWS
 
         self.capacity = capacity
         self.origins, self.directions = np.empty((2, capacity, 3), np.float32)
@@ -146,17 +146,16 @@ class MapSurface:
             pointing_sigma: rad, of a shot's direction.
 
         Returns:
-            (`solver.ROWS`, N) correspondences, and how many columns of them are filled.
+            (`correspondences.ROWS`, N) correspondences, and how many columns of them are filled.
         """
-        from simtrack.perception.localization.solver import pair
+        from simtrack.perception.localization.correspondences import pair
 
         room = self._room_for(len(view))
         shots = view.origins, view.directions, view.ranges, view.sigmas
         limits = gate, pointing_sigma, self.patch_variance
-        room_for_it = self._counts, room.patches, room.pairs
-        return room.pairs, pair(
-            T_map_base, shots, _arrays(view.hits), self._planes, self.instance, *limits, *room_for_it
-        )
+        space = self._counts, room.patches, room.pairs
+        count = pair(T_map_base, shots, _arrays(view.hits), self._planes, self.instance, *limits, *space)
+        return room.pairs, int(count)
 
     def _room_for(self, count: int) -> _Room:
         if self._room is None or self._room.capacity < count:

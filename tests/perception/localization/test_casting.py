@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from simtrack.geometry.transforms import apply, exp_so3, log_so3, perturb, transform, transform_planar
 from simtrack.perception.localization.assessment import assess
 from simtrack.perception.localization.config import MotionConfig, RegistrationConfig
+from simtrack.perception.localization.correspondences import ROWS, kernel_scale
 from simtrack.perception.localization.kernels import BLOCK, rotation_vector, thinned_count, turn
 from simtrack.perception.localization.measurement import Measurement, deskew
 from simtrack.perception.localization.motion import OdometryTrack
 from simtrack.perception.localization.registration import register
-from simtrack.perception.localization.solver import ROWS, kernel_scale
 from simtrack.perception.localization.surface import MapSurface
 
 TRUE = transform_planar(3.0, 2.5, 0.3)
