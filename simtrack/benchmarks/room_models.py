@@ -24,7 +24,8 @@ LAYOUTS = 4
 """Ways to furnish a room."""
 ROOM_FACES, CORRIDOR_FACES = 3000, 400
 """Triangles of a room's structure."""
-_WALL = 0.08
+_WALL, _SLAB = 0.08, 0.02
+"""Thickness of walls, and of floor and ceiling, between which the walls stand."""
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Lower and upper corner."""
@@ -62,10 +63,7 @@ def _arrangement(layout: int) -> list[tuple[str, Float64]]:
 
 
 def _slabs(depth: float) -> list[Box]:
-    return [
-        ((0.0, 0.0, 0.0), (WIDTH, depth, 0.02)),
-        ((0.0, 0.0, HEIGHT - 0.02), (WIDTH, depth, HEIGHT)),
-    ]
+    return [((0.0, 0.0, 0.0), (WIDTH, depth, _SLAB)), ((0.0, 0.0, HEIGHT - _SLAB), (WIDTH, depth, HEIGHT))]
 
 
 def _wall(wall: int, depth: float, doors: int) -> list[Box]:
@@ -73,15 +71,15 @@ def _wall(wall: int, depth: float, doors: int) -> list[Box]:
     length = WIDTH if wall in (SOUTH, NORTH) else depth
     across = {SOUTH: 0.0, NORTH: depth - _WALL, WEST: 0.0, EAST: WIDTH - _WALL}[wall]
     low, high = 0.5 * (length - DOOR_WIDTH), 0.5 * (length + DOOR_WIDTH)
-    panels = [(0.0, length, 0.0)]
+    panels = [(0.0, length, _SLAB)]
     if wall & doors:
-        panels = [(0.0, low, 0.0), (high, length, 0.0), (low, high, DOOR_HEIGHT)]
+        panels = [(0.0, low, _SLAB), (high, length, _SLAB), (low, high, DOOR_HEIGHT)]
     boxes: list[Box] = []
     for begin, end, bottom in panels:
         if wall in (SOUTH, NORTH):
-            boxes.append(((begin, across, bottom), (end, across + _WALL, HEIGHT)))
+            boxes.append(((begin, across, bottom), (end, across + _WALL, HEIGHT - _SLAB)))
         else:
-            boxes.append(((across, begin, bottom), (across + _WALL, end, HEIGHT)))
+            boxes.append(((across, begin, bottom), (across + _WALL, end, HEIGHT - _SLAB)))
     return boxes
 
 

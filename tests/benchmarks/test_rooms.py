@@ -56,7 +56,7 @@ def test_the_middle_is_the_same_in_worlds_of_every_size() -> None:
 def test_no_ray_leaves_and_doors_are_holes_that_panels_close() -> None:
     made = world()
     regions = made.index.regions
-    with PagedScene(made.index, made.meshes, PagingConfig(reach=120.0)) as scene:
+    with PagedScene(made.index, made.meshes, PagingConfig(reach=120.0), use_fallback=False) as scene:
         for region in np.random.default_rng(0).integers(len(regions), size=12):
             middle = 0.5 * (regions.low[region] + regions.high[region])
             assert scene.cast(LIDAR, transform(translation=middle)).hit.all()
@@ -75,7 +75,7 @@ def test_objects_stand_on_something_and_apart() -> None:
     poses, models = made.index.poses(numbers), made.index.models(numbers)
     low = made.index.bounds[models][:, 0, 2]
     down = RayBundle.from_directions([[0.0, 0.0, -1.0]])
-    with PagedScene(made.index, made.meshes, PagingConfig(reach=5.0)) as scene:
+    with PagedScene(made.index, made.meshes, PagingConfig(reach=5.0), use_fallback=False) as scene:
         for T, bottom in zip(poses[::7], low[::7], strict=True):
             below = transform(translation=T[:3, 3] + [0.0, 0.0, bottom - 1e-4])
             hits = scene.cast(down, below, 0.01)

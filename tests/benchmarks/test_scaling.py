@@ -3,10 +3,14 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from simtrack.benchmarks.harness import Options
 from simtrack.benchmarks.scaling import run
+from simtrack.raycast import embree as rtc
 
 
+@pytest.mark.skipif(rtc.fallback_forced() or not rtc.available(), reason="the fallback takes minutes for it")
 def test_a_quick_run_has_all_rows_and_draws_its_plot(tmp_path: Path) -> None:
     options = Options(quick=True)
     result = run(options)

@@ -31,7 +31,7 @@ def world(count: int = 100, seed: int = 0) -> rooms.Rooms:
 class AllLive:
     """Everything in one scene: objects under their ids, closed portals after them."""
 
-    def __init__(self, paged: PagedScene, use_fallback: bool | None = None) -> None:
+    def __init__(self, paged: PagedScene, use_fallback: bool = False) -> None:
         index = paged.index
         self.scene, self.paged = RayScene(use_fallback), paged
         self.panel = TriangleMesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
@@ -49,13 +49,12 @@ class AllLive:
         else:
             self.scene.add(self.panel, self.paged.regions.rectangle(portal), instance=self.panels + portal)
 
-    def assert_same(self, paged: PagedHits, live: RayHits) -> None:
+    def assert_same(self, paged: PagedHits, live: RayHits, coinciding: float = 2e-3) -> None:
         portals = paged.portals
         instances = np.where(portals >= 0, self.panels + portals, paged.objects)
         np.testing.assert_allclose(paged.distances, live.distances, rtol=3e-7)
-        # Where faces meet or coincide (a panel and the wall around it), which one is hit first depends on what else is in
-        # the scene, and with it the last bit.
+        # Where faces meet or coincide, which one is hit first depends on what else there is, and with it the last bit.
         same = (instances == live.instances) & (paged.faces == live.faces)
-        assert np.count_nonzero(~same) <= 0.03 * len(same)
+        assert np.count_nonzero(~same) <= coinciding * len(same)
         np.testing.assert_array_equal(paged.distances[same], live.distances[same])
         np.testing.assert_array_equal(paged.normals[same], live.normals[same])
