@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from simtrack.contracts import Float64
+from simtrack.contracts import Float32, Float64
 from simtrack.perception.localization.assessment import Assessment, assess, judge
 from simtrack.perception.localization.config import RegistrationConfig
 from simtrack.perception.localization.measurement import Measurement
@@ -75,7 +75,7 @@ def register(
     prior, upright = np.linalg.inv(covariance + 1e-14 * np.eye(6)), floor_information(config)
     own = np.diag([config.systematic_sigma**2] * 3 + [config.systematic_angle**2] * 3)
     own = own if systematic is None else own + systematic
-    reach = float(np.median(measurement.ranges[::8])) if len(measurement) else 0.0
+    reach = _typical(measurement.ranges)
     gate = _clip_gate(3.0 * _spread(covariance, reach), config)
     strides = config.strides if strides is None else strides
     assessment: Assessment | None = None
@@ -124,6 +124,12 @@ def floor_information(config: RegistrationConfig) -> Float64:
 def _second_surfaces(gate: float) -> float:
     """Metres by which a shot must reach through a surface to be sought behind it; none is while the pose is vague."""
     return max(2.0 * PASSED_OVER, 6.0 * gate) if gate <= PASSED_OVER else np.inf
+
+
+def _typical(ranges: Float32) -> float:
+    """m: median of a sixteenth of the ranges, 0 if there are none."""
+    some = ranges[::16]
+    return float(np.partition(some, len(some) // 2)[len(some) // 2]) if len(some) else 0.0
 
 
 def _spread(covariance: Float64, reach: float) -> float:
