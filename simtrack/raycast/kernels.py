@@ -17,7 +17,7 @@ import numba as nb
 import numpy as np
 
 from simtrack.raycast import packets
-from simtrack.raycast.vector import fill_float, rotate
+from simtrack.raycast.vector import any_within, carray, fill_float, pointer, rotate
 
 GROUP = 8
 """Packets of a bundle that share a cone."""
@@ -139,19 +139,24 @@ def _meets(cone, disc):
 
 
 @nb.njit(cache=True, nogil=True)
-def _to_trace(world, cones, group, discs, rays):
-    """Which hierarchies the packets of a group have to be traced in, and how: flags. `rays` is their number."""
-    flags = 0
+def _to_trace(world, cones, group, discs, rays, met):
+    """Which hierarchies the packets of a group may have to be traced in, and how: flags; and how many discs are `met`.
+
+    `rays` is their number. With others to trace and none met, there is no telling which they are.
+    """
+    flags, count = 0, 0
     last = discs.shape[0] - 1
     if cones.shape[0] == 0:
         flags = _OTHERS_COHERENT | _GROUND_COHERENT
-        return flags | (_OTHERS if world.others else 0) | (_GROUND if world.ground else 0)
+        return flags | (_OTHERS if world.others else 0) | (_GROUND if world.ground else 0), 0
     cone = cones[group]
     limit = np.float32(_FACES_PER_RAY) * np.float32(rays)
     if world.others and last == 0:
         flags = _OTHERS | _OTHERS_COHERENT
     for j in range(last):
         if _meets(cone, discs[j]):
+            met[count] = j
+            count += 1
             flags |= _OTHERS
             if discs[j, 5] * cone[5] <= limit:
                 flags |= _OTHERS_COHERENT
@@ -159,7 +164,18 @@ def _to_trace(world, cones, group, discs, rays):
         flags |= _GROUND
         if discs[last, 5] * cone[5] <= limit:
             flags |= _GROUND_COHERENT
-    return flags
+    return flags, count
+
+
+@nb.njit(cache=True, nogil=True)
+def _any_meets(lanes, directions, discs, met, count):
+    """Whether a ray of a packet (addresses of the directions and discs) may meet one of the first `count` of `met`."""
+    for k in range(count):
+        disc = discs + 24 * met[k]
+        cosine = carray(pointer(disc), 4, np.float32)[3] - np.float32(2e-6)
+        if cosine < np.float32(0.01) or any_within(lanes, directions, disc, cosine):
+            return True
+    return count == 0
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -174,26 +190,28 @@ def _bundle_chunk(chunk, lanes, world_fields, bundle_fields, discs, near, far, t
     p_packed, p_order = packets.address(bundle.packed), packets.address(bundle.order)
     p_rows, p_motion = packets.address(rows), packets.address(motion)
     p_distances, p_normals, p_faces, p_instances = out
+    p_discs, met = packets.address(discs), np.empty(discs.shape[0], np.int64)
     blocks, cones = bundle.packed.shape[0], bundle.cones
     for axis in range(3):
         fill_float(lanes, p_packet + 4 * axis * width, bundle.pose[axis, 3])
     for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, blocks), GROUP):
-        flags = _to_trace(world, cones, first // GROUP, discs, GROUP * width)
+        flags, count = _to_trace(world, cones, first // GROUP, discs, GROUP * width, met)
         if together >= 0:
             flags = flags & (_OTHERS | _GROUND) | (together * (_OTHERS_COHERENT | _GROUND_COHERENT))
         for block in range(first, min(first + GROUP, blocks)):
             rays = p_order + 4 * block * width
             packets.announce(lanes, block, rays, p_distances, p_normals, p_faces, p_instances)
             packets.reset(lanes, p_packet, far)
-            rotate(lanes, p_pose, p_packed + 12 * block * width, p_packet + 16 * width)
-            if flags & _OTHERS:
+            directions = p_packed + 12 * block * width
+            rotate(lanes, p_pose, directions, p_packet + 16 * width)
+            if flags & _OTHERS and _any_meets(lanes, directions, p_discs, met, count):
                 packets.intersect(lanes, p_valid, others, p_packet, p_together if flags & _OTHERS_COHERENT else p_alone)
             if flags & _GROUND:
                 packets.intersect(lanes, p_valid, ground, p_packet, p_together if flags & _GROUND_COHERENT else p_alone)
             if not packets.turn_alike(lanes, p_packet, ground_id, p_rows, p_motion):
                 packets.turn_mixed(lanes, packet, integers, ground_id, rows, motion, keys)
             packets.write(lanes, p_packet, rays, p_distances, p_normals, p_faces, p_instances)
-    return valid[0] + np.int32(arguments[0, 0])
+    return valid[0] + np.int32(arguments[0, 0]) + np.int32(discs[0, 0])
 
 
 @nb.njit(cache=True, nogil=True)

@@ -3,7 +3,8 @@
 Layout of RTCRayHitW for W rays, in units of W 4-byte words: origin xyz 0-2, tnear 3, direction xyz 4-6, time 7, tfar 8,
 mask 9, id 10, flags 11 | normal xyz 12-14, u 15, v 16, primitive 17, geometry 18, instance 19, instance primitive 20.
 
-`lanes` is a tuple as long as the packet is wide: the type fixes its length, so that loops over lanes unroll.
+`lanes` is a tuple as long as the packet is wide: the type fixes its length, so that loops over lanes unroll. What runs
+for each packet is inlined, because calls hand over all of its elements.
 """
 
 import numba as nb
@@ -62,7 +63,7 @@ def arguments():
     return words
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, inline="always")
 def intersect(lanes, valid, scene, packet, arguments):
     """Nearest hits of a packet in a scene; all but `lanes` are addresses."""
     if len(lanes) == 16:
@@ -80,7 +81,7 @@ def occlude(lanes, valid, scene, packet, arguments):
         _rtcOccluded8(valid, scene, packet, arguments)
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, inline="always")
 def reset(lanes, packet, far):
     """Make a packet (its address) ready for another query: nothing met up to `far`."""
     row = 4 * len(lanes)
@@ -114,7 +115,7 @@ def _moving_normal_matrix(motion, keys, instance, time):
     return _normal_matrix((np.float32(1) - fraction) * keys[row] + fraction * keys[row + 1]).reshape(9)
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, inline="always")
 def turn_alike(lanes, packet, ground_id, rows, motion):
     """Normals of a packet (its address), if all lanes met the same instance at rest or nothing; returns whether so.
 
@@ -168,7 +169,7 @@ def turn_mixed(lanes, packet, integers, ground_id, rows, motion, keys):
         packet[14 * width + k] = z * scale
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, inline="always")
 def announce(lanes, block, order, distances, normals, faces, instances):
     """Begin to fetch where a packet's hits will be written: tracing takes long enough for that; see `write`.
 
@@ -183,7 +184,7 @@ def announce(lanes, block, order, distances, normals, faces, instances):
         prefetch(normals + 12 * ray)
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, inline="always")
 def write(lanes, packet, order, distances, normals, faces, instances):
     """Copy the hits of one packet to the outputs; all arguments are addresses, `order` that of the packet's rays."""
     row = 4 * len(lanes)

@@ -16,7 +16,7 @@ from simtrack.raycast import fallback, instancing, kernels
 from simtrack.raycast.bundle import RayBundle
 from simtrack.raycast.hits import ClosestPoints, RayHits
 from simtrack.raycast.mesh import TriangleMesh
-from simtrack.raycast.table import InstanceTable, checked_poses
+from simtrack.raycast.table import InstanceTable, checked_pose, checked_poses
 
 MAX_INSTANCE = 1 << 21
 """Instance ids are below this: tables are indexed by them."""
@@ -254,7 +254,7 @@ class RayScene:
                 may meet and its number of faces. The results are the same.
             out: results to overwrite and return (from `RayHits.empty`); saves the allocation.
         """
-        T = checked_poses(T_map_sensor, "T_map_sensor", 1)[0]
+        T = checked_pose(T_map_sensor, "T_map_sensor")
         self.commit()
         hits = RayHits.reuse(out, len(bundle))
         if self.fallback:

@@ -92,6 +92,38 @@ def _product(columns: int, unit: bool) -> Any:
     return product
 
 
+def _any_within(typing_context: Any, lanes: Any, directions: Any, axis: Any, cosine: Any) -> Any:
+    """Intrinsic ``any_within(lanes, directions, axis, cosine)``: whether a lane's direction lies in a cone.
+
+    Args:
+        typing_context: of numba.
+        lanes: see the module.
+        directions: address of rows x, y, z of any length.
+        axis: address of the unit axis, three floats.
+        cosine: of the half opening angle, which is below 90 degrees.
+    """
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
+        width = lanes.count
+        entry = builder.inttoptr(arguments[2], _FLOAT.as_pointer())
+        along, square = None, None
+        for k in range(3):
+            row = _vector_at(builder, _offset(builder, arguments[1], k * width), _FLOAT, width)
+            value = builder.load(row, align=4)
+            part = builder.load(builder.gep(entry, [ir.Constant(_INT, k)]), align=4)
+            term = builder.fmul(_splat(builder, part, width), value)
+            along = term if along is None else builder.fadd(along, term)
+            term = builder.fmul(value, value)
+            square = term if square is None else builder.fadd(square, term)
+        limit = builder.fmul(_splat(builder, builder.fmul(arguments[3], arguments[3]), width), square)
+        ahead = builder.fcmp_ordered(">", along, ir.Constant(ir.VectorType(_FLOAT, width), [0.0] * width))
+        inside = builder.and_(ahead, builder.fcmp_ordered(">=", builder.fmul(along, along), limit))
+        bits = builder.bitcast(inside, ir.IntType(width))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(width), 0))
+
+    return types.boolean(lanes, types.intp, types.intp, types.float32), generate
+
+
 def _scatter(typing_context: Any, lanes: Any, source: Any, order: Any, target: Any, stride: Any) -> Any:
     """Intrinsic ``scatter(lanes, source, order, target, stride)``: copy a row of the packet to elements of an array.
 
@@ -141,6 +173,8 @@ carray: Any = nb.carray  # pyright: ignore[reportPrivateImportUsage]
 """``carray(pointer(address), count, dtype)``: array of what stands at an address, without ownership."""
 scatter: Any = intrinsic(prefer_literal=True)(_scatter)
 """``scatter(lanes, source, order, target, stride)``: lane k of a row goes to word ``stride * order[k]`` of `target`."""
+any_within: Any = intrinsic(_any_within)
+"""``any_within(lanes, directions, axis, cosine)``: whether one of W directions lies in a cone of less than 90 deg."""
 prefetch: Any = intrinsic(_prefetch)
 """``prefetch(address)`` begins to fetch a cache line that will be written to."""
 fill_float: Any = intrinsic(_fill(_FLOAT, types.float32))
