@@ -57,7 +57,7 @@ class ClosestPoints:
     points: Float32
     """(N, 3), map frame, metres; the query point itself where nothing lies within the maximum distance."""
     distances: Float32
-    """(N,), metres, inf = nothing within the maximum distance."""
+    """(N,), metres, inf = nothing within the maximum distance; negative inside closed meshes if signs are asked for."""
     instances: Int32
     """(N,), instance id, -1 = nothing."""
     faces: Int32

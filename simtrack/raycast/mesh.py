@@ -14,6 +14,8 @@ from simtrack.raycast import embree as rtc
 if TYPE_CHECKING:
     from embreex.rtcore_scene import EmbreeScene
 
+    from simtrack.raycast.topology import Topology
+
 
 class TriangleMesh:
     """Triangles in their own frame with one Embree hierarchy, shareable between scenes and instances."""
@@ -53,6 +55,13 @@ class TriangleMesh:
         low, high = self.vertices.min(0).astype(np.float64), self.vertices.max(0).astype(np.float64)
         centre = (low + high) / 2
         return centre, float(np.sqrt(((self.vertices - centre) ** 2).sum(1).max()))
+
+    @cached_property
+    def topology(self) -> "Topology":
+        """Which faces meet where, and whether they close the mesh."""
+        from simtrack.raycast.topology import Topology
+
+        return Topology.of(self.vertices, self.faces)
 
     @cached_property
     def scene_handle(self) -> int:

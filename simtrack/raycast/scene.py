@@ -327,12 +327,16 @@ class RayScene:
             kernels.run(len(limit), kernels.occluded, kernels.occluded_parallel, *arguments)
         return blocked
 
-    def closest_points(self, points: npt.ArrayLike, max_distance: float = np.inf) -> ClosestPoints:
+    def closest_points(
+        self, points: npt.ArrayLike, max_distance: float = np.inf, *, signed: bool = False
+    ) -> ClosestPoints:
         """Nearest surface points of the enabled instances; moving ones stand at their first key.
 
         Args:
             points: (N, 3), map frame, metres; one that is not finite finds nothing.
             max_distance: metres; what is farther counts as nothing.
+            signed: distances are negative for points inside the instance whose surface is nearest, if its mesh is
+                closed (`TriangleMesh.topology`); positive outside of it, and near a mesh that has no inside.
 
         Raises:
             InvalidValueError: wrong shape, or a negative distance.
@@ -353,6 +357,8 @@ class RayScene:
             output = (found.points, found.distances, found.instances, found.faces)
             arguments = (closest.CALLBACK, queries, float(max_distance), self._table.buffers, self._table.poses)
             kernels.run(16 * count, closest.closest, closest.closest_parallel, *self._world[:3], *arguments, *output)
+        if signed:
+            self._give_signs(queries, found)
         return found
 
     # -------------------------------------------------------------------------------------------------- life and end
@@ -384,6 +390,16 @@ class RayScene:
         if instance not in self._meshes:
             raise InvalidValueError("instance", instance, f"one of {self.instances}")
         return instance
+
+    def _give_signs(self, points: Float32, found: ClosestPoints) -> None:
+        from simtrack.raycast.topology import give_signs
+
+        for number in np.unique(found.instances[found.instances >= 0]).tolist():
+            mesh, chosen = self._meshes[number], np.flatnonzero(found.instances == number)
+            around = mesh.topology
+            if around.closed:
+                shape = mesh.vertices, mesh.faces, around.corners, around.across, around.ring_start, around.ring
+                give_signs(points, *shape, self._table.poses[number], chosen, found.faces, found.distances)
 
     def _posed(self) -> dict[int, Instance]:
         poses, enabled = self._table.poses, self._table.enabled
