@@ -91,24 +91,31 @@ def deskew_shots(
 def _sensor_track(T_base_lidar: Float64, knot_times: Float64, knots: Float64) -> tuple[Float64, np.ndarray]:
     """Times (L,) and T_end_lidar (L, 3, 4) float32, L >= 2, so close that between them linear interpolation does."""
     spans = knot_times.shape[0] - 1
-    clocks, track = [knot_times[0]], [knots[0] @ T_base_lidar]
-    T = np.eye(4)
+    turns, pieces = np.empty((spans, 3)), np.ones(spans + 1, np.int64)
     for k in range(spans):
         phi = rotation_vector(knots[k + 1], knots[k])
-        pieces = int(np.sqrt(phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2) / _BEND) + 1
-        for piece in range(1, pieces + 1):
-            share = piece / pieces
-            turn(share * phi[0], share * phi[1], share * phi[2], knots[k], T)
-            T[:3, 3] = (1.0 - share) * knots[k, :3, 3] + share * knots[k + 1, :3, 3]
-            clocks.append((1.0 - share) * knot_times[k] + share * knot_times[k + 1])
-            track.append(T @ T_base_lidar)
+        turns[k], pieces[k] = phi, int(np.sqrt(phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2) / _BEND) + 1
+    count = max(pieces.sum(), 2)
+    clocks, poses, T, row = np.empty(count), np.empty((count, 3, 4), np.float32), np.empty((3, 4)), 0
+    for k in range(spans + 1):
+        ahead = min(k + 1, spans)
+        for piece in range(pieces[k]):
+            share = piece / pieces[k]
+            T[:] = knots[k, :3]
+            if k < spans:
+                turn(share * turns[k, 0], share * turns[k, 1], share * turns[k, 2], knots[k], T)
+            for a in range(3):
+                T[a, 3] += share * (knots[ahead, a, 3] - knots[k, a, 3])
+                for b in range(4):
+                    value = T[a, 3] if b == 3 else 0.0
+                    for c in range(3):
+                        value += T[a, c] * T_base_lidar[c, b]
+                    poses[row, a, b] = value
+            clocks[row] = knot_times[k] + share * (knot_times[ahead] - knot_times[k])
+            row += 1
     if spans < 1:  # no time passes
-        clocks.append(clocks[0] + 1.0)
-        track.append(track[0])
-    poses = np.empty((len(track), 3, 4), np.float32)
-    for k in range(len(track)):
-        poses[k] = track[k][:3]
-    return np.array(clocks), poses
+        clocks[1], poses[1] = clocks[0] + 1.0, poses[0]
+    return clocks, poses
 
 
 @nb.njit(cache=True, nogil=True)

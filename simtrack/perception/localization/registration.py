@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtrack.contracts import Float32, Float64
+from simtrack.geometry.transforms import difference, orthonormal
 from simtrack.perception.localization.assessment import Assessment, assess, judge
 from simtrack.perception.localization.config import RegistrationConfig
 from simtrack.perception.localization.measurement import Measurement
@@ -68,7 +69,7 @@ def register(
         strides: thinning of the shots, one entry a ray-casting iteration; the config's if None.
         assessed: judge the pose too, by the last cast if the pose moved little since.
     """
-    from simtrack.perception.localization.solver import descend, posterior
+    from simtrack.perception.localization.solver import descend, map_information
 
     T = np.array(T_prior if T_start is None else T_start, dtype=np.float64)
     T_prior = np.ascontiguousarray(T_prior, dtype=np.float64)
@@ -79,7 +80,7 @@ def register(
     gate = _clip_gate(3.0 * _spread(covariance, reach), config)
     strides = config.strides if strides is None else strides
     assessment: Assessment | None = None
-    found, count, steps, turn = None, 0, 0, 0
+    found, count, steps, moved, turn = None, 0, 0, 0.0, 0
     fused = _symmetric(np.linalg.inv(prior + upright))
     while turn < len(strides):
         view = surface.cast(T, measurement, strides[turn], _second_surfaces(gate))
@@ -88,17 +89,22 @@ def register(
             break
         T_cast, last = T, turn == len(strides) - 1
         found = descend(T_cast, pairs, count, T_prior, prior, upright, surface.floor, _rules(config, reach, gate))
-        T, steps = found.T, steps + found.steps
+        T = found.T
+        T[:3, :3], steps = orthonormal(T[:3, :3]), steps + found.steps
+        change = difference(T, T_cast)
+        moved = float(np.linalg.norm(change[:3])) + reach * float(np.linalg.norm(change[3:]))
         if last:
-            fused = posterior(T_cast, pairs, count, found, prior + upright, own)
-            assessment = judge(view) if assessed and found.moved < config.settled else None
-        gate = _clip_gate(2.0 * found.moved + 3.0 * found.residual, config, ceiling=gate)
-        turn = len(strides) - 1 if found.moved < config.settled and not last else turn + 1
+            map_info = map_information(T_cast, T, pairs, count, found.kernel)
+            fused = _symmetric(np.linalg.inv(prior + upright + found.info))
+            fused = _keep_shared_error(fused, map_info, found.basis, found.dual, own)
+            assessment = judge(view) if assessed and moved < config.settled else None
+        gate = _clip_gate(2.0 * moved + 3.0 * found.residual, config, ceiling=gate)
+        turn = len(strides) - 1 if moved < config.settled and not last else turn + 1
     if assessed and assessment is None:
         assessment = assess(measurement.thinned(7), surface, T)
     if found is None or turn < len(strides):
         return Registration(T, fused, False, count, 0.0, 0, steps, assessment)
-    converged = found.moved < 0.5 * config.min_gate
+    converged = moved < 0.5 * config.min_gate
     return Registration(T, fused, converged, count, found.residual, found.basis.shape[1], steps, assessment)
 
 
@@ -124,6 +130,23 @@ def floor_information(config: RegistrationConfig) -> Float64:
 def _second_surfaces(gate: float) -> float:
     """Metres by which a shot must reach through a surface to be sought behind it; none is while the pose is vague."""
     return max(2.0 * PASSED_OVER, 6.0 * gate) if gate <= PASSED_OVER else np.inf
+
+
+def _keep_shared_error(covariance: Float64, map_info: Float64, basis: Float64, dual: Float64, own: Float64) -> Float64:
+    """Covariance that is nowhere below what the errors leave that no averaging removes.
+
+    The map's error is the same in every scan from about the same place, and the systematic ones (`own`) in every shot:
+    the filter must not average them away. `basis` and `dual` are (6, K), see `solver.observable`.
+    """
+    count = basis.shape[1]
+    if not count:
+        return covariance
+    limit = np.linalg.inv(basis.T @ map_info @ basis + 1e-9 * np.eye(count)) + dual.T @ own @ dual
+    root = np.asarray(np.linalg.cholesky(_symmetric(limit)), dtype=np.float64)
+    whiten = np.linalg.solve(root, dual.T)
+    values, vectors = np.linalg.eigh(_symmetric(whiten @ covariance @ whiten.T))
+    lift = basis @ root @ vectors
+    return _symmetric(covariance + (lift * np.maximum(1.0 - values, 0.0)) @ lift.T)
 
 
 def _typical(ranges: Float32) -> float:

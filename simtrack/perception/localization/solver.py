@@ -80,8 +80,6 @@ class Descent(NamedTuple):
 
     T: np.ndarray
     """(4, 4)."""
-    moved: float
-    """m, at `Rules.reach`: how far from the pose of the cast."""
     info: np.ndarray
     """(6, 6) information of the data in the observed directions."""
     basis: np.ndarray
@@ -93,6 +91,19 @@ class Descent(NamedTuple):
     kernel: float
     """m, last scale of the robust kernel."""
     steps: int
+
+
+@njit(cache=True, nogil=True)
+def _since(T_cast, T):
+    """Rotation (3, 3) since the cast, less the identity, and translation (3,)."""
+    motion, shift = np.zeros((3, 3)), np.empty(3)
+    for i in range(3):
+        motion[i, i] = -1.0
+        shift[i] = T[i, 3] - T_cast[i, 3]
+        for j in range(3):
+            for k in range(3):
+                motion[i, j] += T[i, k] * T_cast[j, k]
+    return motion, shift
 
 
 @njit(cache=True, nogil=True)
@@ -112,67 +123,37 @@ def descend(T_cast, pairs, count, T_prior, prior, upright, floor, rules):
     Returns:
         A `Descent`.
     """
-    T, R_cast, away = T_cast.copy(), T_cast[:3, :3].copy(), np.empty(6)
+    T, T_next, held, away = T_cast.copy(), T_cast.copy(), prior + upright, np.empty(6)
     info, basis, dual = np.zeros((6, 6)), np.zeros((6, 0)), np.zeros((6, 0))
     feigned, weight, lever = info, 1.0, 1.0
-    residual, kernel, steps = 0.0, rules.gate, 0
-    while steps < rules.iterations:
-        R = T[:3, :3].copy()
-        motion, shift = R @ R_cast.T - np.eye(3), T[:3, 3] - T_cast[:3, 3]
+    residual, kernel, steps, size = 0.0, rules.gate, 0, np.inf
+    while steps < rules.iterations and size >= rules.tolerance:
+        motion, shift = _since(T_cast, T)
         kernel = kernel_scale(pairs, count, motion, shift, rules.min_kernel, rules.gate)
         H, g, stats = normal_equations(pairs, pairs[7], count, motion, shift, kernel)
         if steps == 0:  # where the points lie changes little: later only the sum of the weights is followed
             feigned, lever = any_normals(pairs, pairs[7], count, kernel)
-            weight = stats[0]
-        share = stats[0] / max(weight, 1e-12)
-        basis, dual = observable(H, share * feigned, lever, rules.normal_sigma, rules.observability)
+            weight = max(stats[0], 1e-12)
+        basis, dual = observable(H, stats[0] / weight * feigned, lever, rules.normal_sigma, rules.observability)
         projector = dual @ np.ascontiguousarray(basis.T)
-        half = projector @ H
-        info = 0.5 * (half + half.T)
+        info = projector @ H
+        info = 0.5 * (info + info.T)
         away[:3], away[3:] = T[:3, 3] - T_prior[:3, 3], rotation_vector(T, T_prior)
         b = projector @ g + prior @ away + upright @ floor_deviation(T, floor)
-        step = -np.linalg.solve(info + prior + upright, b)
-        turn(step[3], step[4], step[5], R, T)
-        T[:3, 3] += step[:3]
+        step = np.linalg.solve(info + held, b)
+        turn(-step[3], -step[4], -step[5], T, T_next)
+        size = 0.0
+        for a in range(3):
+            T_next[a, 3] = T[a, 3] - step[a]
+            size = max(size, abs(step[a]), rules.reach * abs(step[3 + a]))
+        T[:] = T_next
         steps += 1
         residual = np.sqrt(stats[1] / max(stats[0], 1e-12))
-        if max(np.abs(step[:3]).max(), rules.reach * np.abs(step[3:]).max()) < rules.tolerance:
-            break
-    R = T[:3, :3].copy()
-    T[:3, :3] = R @ (1.5 * np.eye(3) - 0.5 * R.T @ R)  # orthonormal to rounding
-    turned, shifted = rotation_vector(T, T_cast), T[:3, 3] - T_cast[:3, 3]
-    moved = np.sqrt((shifted**2).sum()) + rules.reach * np.sqrt((turned**2).sum())
-    return Descent(T, moved, info, basis, dual, residual, kernel, steps)
+    return Descent(T, info, basis, dual, residual, kernel, steps)
 
 
 @njit(cache=True, nogil=True)
-def posterior(T_cast, pairs, count, found, held, own):
-    """(6, 6) covariance after a descent, nowhere below what the errors leave that no averaging removes.
-
-    The map's error is the same in every scan from about the same place, and the systematic ones in every shot: the
-    filter must not average them away.
-
-    Args:
-        T_cast: (4, 4) pose of the cast.
-        pairs: (`ROWS`, N) correspondences, of which `count` columns count.
-        count: see `pairs`.
-        found: the `Descent`.
-        held: (6, 6) information of the prediction and of standing upright.
-        own: (6, 6) covariance of the systematic errors.
-    """
-    covariance = np.linalg.inv(held + found.info)
-    basis, dual = found.basis, found.dual
-    if not basis.shape[1]:
-        return covariance
-    motion = found.T[:3, :3].copy() @ T_cast[:3, :3].copy().T - np.eye(3)
-    shift = found.T[:3, 3] - T_cast[:3, 3]
-    map_info, _, _ = normal_equations(pairs, pairs[8], count, motion, shift, found.kernel)
-    rows, columns = np.ascontiguousarray(basis.T), np.ascontiguousarray(dual.T)
-    limit = np.linalg.inv(rows @ map_info @ basis + 1e-9 * np.eye(basis.shape[1])) + columns @ own @ dual
-    root = np.linalg.cholesky(0.5 * (limit + limit.T))
-    whiten = np.linalg.inv(root) @ columns
-    relative = whiten @ covariance @ whiten.T
-    values, vectors = np.linalg.eigh(0.5 * (relative + relative.T))
-    lift = basis @ root @ vectors
-    covariance = covariance + (lift * np.maximum(1.0 - values, 0.0)) @ lift.T
-    return 0.5 * (covariance + covariance.T)
+def map_information(T_cast, T, pairs, count, kernel):
+    """(6, 6) information that the map's error alone would leave all rays of a cast, at pose T (4, 4)."""
+    motion, shift = _since(T_cast, T)
+    return normal_equations(pairs, pairs[8], count, motion, shift, kernel)[0]
