@@ -8,99 +8,15 @@ moved.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64
-from simtrack.errors import InvalidValueError
 from simtrack.perception.tracking import correspondences as kernels
 from simtrack.perception.tracking import solver
+from simtrack.perception.tracking.registration_config import RegistrationConfig, Step
 from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One outer iteration: a cast and a few solver steps."""
-
-    gate: float
-    """Correspondences further apart than this along the model's normal are dropped, metres; 3 sigma of the sensor are
-    added."""
-    kernel: float
-    """Scale of the Geman-McClure kernel, standard deviations."""
-    edge_reach: int
-    """How far from the model's edge a discontinuity is sought, pixels."""
-    coarsen: int = 1
-    """Take every so many-th row and column of each model's pixel grid."""
-    repeats: int = 1
-    """Cast again up to this often while an instance still moves by more than the configured tolerance."""
-    silhouettes: Literal["always", "where-open", "never"] = "where-open"
-    """Silhouettes widen the basin of convergence; they are coarse, so that in the end they only speak in directions
-    that the faces leave open."""
-
-
-@dataclass(frozen=True, slots=True)
-class RegistrationConfig:
-    """Settings of `Registration`."""
-
-    solver: Literal["gauss-newton", "umeyama"] = "gauss-newton"
-    """``umeyama`` is the tracking paper's closed-form fit, iterated on fixed correspondences."""
-    schedule: tuple[Step, ...] = (
-        Step(gate=0.04, kernel=12.0, edge_reach=14, silhouettes="always", coarsen=2),
-        Step(gate=0.03, kernel=8.0, edge_reach=12, silhouettes="always", coarsen=2),
-        Step(gate=0.02, kernel=6.0, edge_reach=10, silhouettes="always"),
-        Step(gate=0.012, kernel=4.0, edge_reach=8, silhouettes="always", repeats=6),
-        Step(gate=0.008, kernel=3.0, edge_reach=6),
-        Step(gate=0.006, kernel=3.0, edge_reach=5, repeats=12),
-    )
-    """Outer iterations, coarse to fine."""
-    track_schedule: tuple[Step, ...] = (
-        Step(gate=0.02, kernel=6.0, edge_reach=8, silhouettes="always", coarsen=2),
-        Step(gate=0.01, kernel=4.0, edge_reach=6, coarsen=2),
-        Step(gate=0.006, kernel=3.0, edge_reach=5, repeats=2),
-    )
-    """Outer iterations from a good prediction, as of a track."""
-    inner_iterations: int = 3
-    """Solver steps on the same correspondences (the paper: 10 Umeyama fits)."""
-    tolerance: float = 5e-5
-    """An instance that an outer iteration moves by less than this has converged, metres of surface."""
-    settled: float = 1e-3
-    """... and by less than this needs no other coarse iteration."""
-    max_shift: float = 0.01
-    """Longest solver step, metres: correspondences are only valid near where they were cast."""
-    max_turn: float = np.deg2rad(2.0)
-    """Largest solver step, radians."""
-    edge_kernel: float = 3.0
-    """Scale of the kernel on silhouette offsets, standard deviations."""
-    edge_step: float = 0.02
-    """Smallest depth step at a silhouette, metres."""
-    model_sigma: float = 0.0005
-    """Standard deviation of the models' surfaces, metres."""
-    focal_baseline: float = 577.0 * 0.075
-    """Focal length times baseline of the depth sensor, px m (Xtion)."""
-    unconstrained_sigma: float = 0.01
-    """A direction known less well than this from the data, metres (of the surface, for rotations), is not moved."""
-    correlation_area: float = 12.0
-    """Depth errors are correlated over this many pixels: that many readings count as one."""
-    edge_correlation: float = 4.0
-    """As `correlation_area`, for silhouette pixels."""
-    edge_sigma: float = 0.0015
-    """Silhouettes are listened to in directions that the faces leave less certain than this, metres of surface."""
-    systematic_translation: float = 0.0004
-    """Error of the pose that more pixels do not average out (model scale, sensor bias), metres."""
-    systematic_rotation: float = 0.003
-    """As `systematic_translation`, radians."""
-    max_rays: int = 2500
-    """Coarser pixel grids are used for models whose image window holds more pixels than this."""
-
-    def __post_init__(self) -> None:
-        if self.solver not in ("gauss-newton", "umeyama"):
-            raise InvalidValueError("RegistrationConfig.solver", self.solver, "gauss-newton, umeyama")
-        if not self.schedule or any(step.gate <= 0.0 or step.kernel <= 0.0 for step in self.schedule):
-            raise InvalidValueError(
-                "RegistrationConfig.schedule", self.schedule, "steps with positive gates and kernels"
-            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,20 +116,40 @@ class Registration:
             A result for each instance in `poses` whose box projects into the image.
 
         """
-        config, steps = self.config, schedule or self.config.schedule
         batch = self._batch(depth, intrinsics, poses, fixed)
         if batch is None:
             return {}
+        self._follow(batch, schedule or self.config.schedule, np.ones(len(batch.instances), bool))
+        return batch.results(self.config)
+
+    def track(
+        self, depth: Float32, intrinsics: CameraIntrinsics, poses: Mapping[int, Float64]
+    ) -> dict[int, RegistrationResult]:
+        """Register instances from good predictions, see `register`: those that are near get by with little work."""
+        config = self.config
+        batch = self._batch(depth, intrinsics, poses, None)
+        if batch is None:
+            return {}
+        predicted = batch.poses.copy()
+        self._follow(batch, (config.near,), np.ones(len(batch.instances), bool))
+        far = ~batch.near(predicted, config)
+        if far.any():
+            batch.poses[far] = predicted[far]
+            self._follow(batch, config.track_schedule, far)
+        return batch.results(config)
+
+    def _follow(self, batch: "_Batch", steps: Sequence[Step], chosen: npt.NDArray[np.bool_]) -> None:
+        """Take the chosen instances through outer iterations."""
+        config = self.config
         for number, step in enumerate(steps):
             # What the last step hardly moved needs no more coarse ones.
             last = number == len(steps) - 1
-            batch.active[:] = True if last or number == 0 else batch.moved > config.settled
+            batch.active[:] = chosen if last or number == 0 else chosen & (batch.moved > config.settled)
             for _ in range(step.repeats):
                 if not batch.active.any():
                     break
                 self._iterate(batch, step, config.inner_iterations)
-                batch.active &= batch.moved > config.tolerance
-        return batch.results(config)
+                batch.active &= (batch.moved > config.tolerance) & (batch.deviations > config.insignificant)
 
     def assess(
         self,
@@ -341,8 +277,8 @@ class _Batch:
         self.strides = np.where(area <= max_rays, 1, np.where(area <= 4 * max_rays, 2, 4))
         """(K,), pixel grids; chosen once for a registration, so that iterations do not alternate."""
         count = len(self.instances)
-        self.active, self.moved = np.ones(count, bool), np.zeros(count)
-        """(K,), takes part in the present iteration; (K,), metres of surface moved by its last one."""
+        self.active, self.moved, self.deviations = np.ones(count, bool), np.zeros(count), np.zeros(count)
+        """(K,), takes part in the present iteration; how far its last one moved: surface metres, standard deviations."""
         self.counts, self.edges = np.zeros((count, kernels.FIELDS), np.int64), np.zeros(count, np.int64)
         self.used = self.strides.copy()
         self.covariance, self.constrained = np.zeros((count, 6, 6)), np.zeros(count, np.int64)
@@ -360,6 +296,16 @@ class _Batch:
         """Find the pixel windows of the present poses."""
         size = (self.intrinsics.width, self.intrinsics.height)
         kernels.image_windows(self._corners, self.poses, self.camera, size, 4, self.windows)
+
+    def near(self, predicted: Float64, config: RegistrationConfig) -> npt.NDArray[np.bool_]:
+        """(K,), whether an instance fits well, not far from its predicted pose (K, 4, 4)."""
+        supported, missing = self.counts[:, kernels.SUPPORTED], self.counts[:, kernels.MISSING]
+        support = supported / np.maximum(supported + missing, 1)
+        misfit = self.stats[:, 1] / np.maximum(self.stats[:, 0], 1e-9)
+        shift = np.linalg.norm(self.poses[:, :3, 3] - predicted[:, :3, 3], axis=1)
+        trace = np.einsum("kij,kij->k", self.poses[:, :3, :3], predicted[:, :3, :3])
+        moved = shift + np.sqrt(np.maximum(3.0 - trace, 0.0)) * self._radii
+        return (support >= config.near_support) & (misfit <= config.near_misfit) & (moved <= config.near_move)
 
     def solve(
         self,
@@ -391,7 +337,9 @@ class _Batch:
             np.maximum(1.0, shares), self.active, settings, steps, self.covariance, self.constrained, self.stats,
         )  # fmt: skip
         if iterations:
-            solver.advance(self.poses, rotations, shifts, self._radii, self.active, self.moved)
+            solver.advance(
+                self.poses, rotations, shifts, self._radii, self.covariance, self.active, self.moved, self.deviations
+            )
 
     def results(self, config: RegistrationConfig) -> dict[int, RegistrationResult]:
         """Results of every instance at its present pose."""

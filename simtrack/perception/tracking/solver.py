@@ -206,15 +206,29 @@ def umeyama(points, pairs, centres, rotations, shifts, iterations):
 
 
 @njit(cache=True, nogil=True)
-def advance(poses, rotations, shifts, radii, active, moved):
-    """Apply motions to the active of the poses (K, 4, 4), in place; `moved` (K,): how far, metres of surface."""
+def advance(poses, rotations, shifts, radii, covariance, active, moved, deviations):
+    """Apply motions to the active of the poses (K, 4, 4), in place.
+
+    Out: `moved` (K,), how far, metres of surface; `deviations` (K,), how far in standard deviations of the estimate,
+    whose `covariance` is (K, 6, 6).
+    """
+    L, xi = np.empty((6, 6)), np.empty(6)
     for k in range(poses.shape[0]):
-        moved[k] = 0.0
+        moved[k], deviations[k] = 0.0, 0.0
         if not active[k]:
             continue
-        R = rotations[k] @ np.ascontiguousarray(poses[k, :3, :3])
+        turn = rotations[k]
+        R = turn @ np.ascontiguousarray(poses[k, :3, :3])
         # A Newton step of the polar decomposition keeps the product orthonormal.
         poses[k, :3, :3] = R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R))
         poses[k, :3, 3] += shifts[k]
-        turned = np.sqrt(max(3.0 - (rotations[k, 0, 0] + rotations[k, 1, 1] + rotations[k, 2, 2]), 0.0))
-        moved[k] = np.sqrt(shifts[k, 0] ** 2 + shifts[k, 1] ** 2 + shifts[k, 2] ** 2) + turned * radii[k]
+        angle = np.sqrt(max(3.0 - (turn[0, 0] + turn[1, 1] + turn[2, 2]), 0.0))
+        moved[k] = np.sqrt(shifts[k, 0] ** 2 + shifts[k, 1] ** 2 + shifts[k, 2] ** 2) + angle * radii[k]
+        xi[:3] = shifts[k]
+        xi[3], xi[4], xi[5] = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+        xi[3:] *= 0.5
+        deviations[k] = np.inf
+        if cholesky(covariance[k], 0.0, L):
+            weighted = xi.copy()
+            _substitute(L, weighted)
+            deviations[k] = np.sqrt(max(xi @ weighted, 0.0))

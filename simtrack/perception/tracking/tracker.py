@@ -114,8 +114,7 @@ class ObjectTracker:
         poses = {t.id: T_camera_map @ t.filter.predict(view.stamp).T_map_object for t in living}
         results = {}
         if np.any(view.depth):
-            steps = self.config.registration.track_schedule
-            results = self._registration.register(view.depth, view.intrinsics, poses, schedule=steps)
+            results = self._registration.track(view.depth, view.intrinsics, poses)
         for target in living:
             self._judge(target, view, poses[target.id], results.get(target.id))
 

@@ -120,12 +120,14 @@ def test_the_short_way_through_a_well_known_system_is_the_long_one() -> None:
 
 def test_poses_stay_rigid_over_many_motions() -> None:
     rng = np.random.default_rng(7)
-    poses, moved = np.eye(4)[None].copy(), np.zeros(1)
+    poses, moved, deviations = np.eye(4)[None].copy(), np.zeros(1), np.zeros(1)
+    covariance, yes = np.diag([1.0] * 3 + [0.25] * 3)[None], np.ones(1, bool)
     expected = np.eye(3)
     for _ in range(500):
         phi = 0.02 * rng.standard_normal(3)
-        solver.advance(poses, exp_so3(phi)[None], np.zeros((1, 3)), np.ones(1), np.ones(1, bool), moved)
+        solver.advance(poses, exp_so3(phi)[None], np.zeros((1, 3)), np.ones(1), covariance, yes, moved, deviations)
         expected = exp_so3(phi) @ expected
         assert abs(moved[0] - np.linalg.norm(phi)) < 1e-4
+        assert abs(deviations[0] - 2.0 * np.linalg.norm(phi)) < 1e-3
     np.testing.assert_allclose(poses[0, :3, :3] @ poses[0, :3, :3].T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(poses[0, :3, :3], expected, atol=1e-11)
