@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from embreex.rtcore_scene import EmbreeScene
 
     from simtrack.raycast.topology import Topology
+    from simtrack.raycast.tree import FaceTree
 
 
 class TriangleMesh:
@@ -62,6 +63,13 @@ class TriangleMesh:
         from simtrack.raycast.topology import Topology
 
         return Topology.of(self.vertices, self.faces)
+
+    @cached_property
+    def tree(self) -> "FaceTree":
+        """Boxes over the faces, for distances between meshes."""
+        from simtrack.raycast.tree import FaceTree
+
+        return FaceTree.of(self.vertices, self.faces)
 
     @cached_property
     def scene_handle(self) -> int:

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from simtrack.contracts import Float32, Int32
 from simtrack.raycast.closest import closest_on_triangle
+from simtrack.raycast.triangles import cross, dot, minus, plus
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +60,7 @@ def _across(corners: Int32, counts: npt.NDArray[np.bool_]) -> Int32:
 
 
 @nb.njit(cache=True, nogil=True)
-def _corner(vertices, faces, face, k, T):
+def corner_of(vertices, faces, face, k, T):
     """Corner of a face in the frame that T leads to, as a tuple."""
     v = faces[face, k]
     x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
@@ -70,23 +71,13 @@ def _corner(vertices, faces, face, k, T):
     )
 
 
-@nb.njit(cache=True, nogil=True)
-def _minus(a, b):
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-@nb.njit(cache=True, nogil=True)
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _unit_normal(vertices, faces, face, T):
     """Unit normal of a face after T, zero for one without area; a mirroring T turns it, the sign of which cancels."""
-    a = _corner(vertices, faces, face, 0, T)
-    u, v = _minus(_corner(vertices, faces, face, 1, T), a), _minus(_corner(vertices, faces, face, 2, T), a)
-    n = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
-    length = np.sqrt(_dot(n, n))
+    a = corner_of(vertices, faces, face, 0, T)
+    u, v = minus(corner_of(vertices, faces, face, 1, T), a), minus(corner_of(vertices, faces, face, 2, T), a)
+    n = cross(u, v)
+    length = np.sqrt(dot(n, n))
     if not length > 0.0:
         return 0.0, 0.0, 0.0
     return n[0] / length, n[1] / length, n[2] / length
@@ -95,13 +86,13 @@ def _unit_normal(vertices, faces, face, T):
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _angle(vertices, faces, face, k, T):
     """Inner angle of a face at corner k, after T."""
-    p = _corner(vertices, faces, face, k, T)
-    u = _minus(_corner(vertices, faces, face, (k + 1) % 3, T), p)
-    v = _minus(_corner(vertices, faces, face, (k + 2) % 3, T), p)
-    scale = np.sqrt(_dot(u, u) * _dot(v, v))
+    p = corner_of(vertices, faces, face, k, T)
+    u = minus(corner_of(vertices, faces, face, (k + 1) % 3, T), p)
+    v = minus(corner_of(vertices, faces, face, (k + 2) % 3, T), p)
+    scale = np.sqrt(dot(u, u) * dot(v, v))
     if not scale > 0.0:
         return 0.0
-    return np.arccos(min(1.0, max(-1.0, _dot(u, v) / scale)))
+    return np.arccos(min(1.0, max(-1.0, dot(u, v) / scale)))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -133,43 +124,37 @@ def _pseudonormal(vertices, faces, corners, across, ring_start, ring, T, face, s
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def give_signs(points, vertices, faces, corners, across, ring_start, ring, T, chosen, nearest_faces, distances):
-    """Negate the distances of the `chosen` points that lie inside a closed mesh whose pose is T.
+def is_inside(p, vertices, faces, corners, across, ring_start, ring, T, face):
+    """Whether a point lies inside a closed mesh whose pose is T, if `face` is the nearest of its faces.
 
     The sign is that of the pseudonormal at the nearest surface point, which tells inside from outside also where that
     is on an edge or a vertex (Baerentzen and Aanaes, Signed distance computation using the angle weighted pseudonormal,
     2005).
 
     Args:
-        points: (N, 3) float32, frame that T leads to.
+        p: tuple of three, frame that T leads to.
         vertices: as the following five, mesh and `Topology`.
         faces: see there.
         corners: see there.
         across: see there.
         ring_start: see there.
         ring: see there.
-        T: (4, 4) affine.
-        chosen: (K,) rows of `points`.
-        nearest_faces: (N,), the face on which the nearest point lies.
-        distances: (N,), written to.
+        T: (4, 4) affine; a mirroring one does not swap the sides.
+        face: the nearest face.
     """
-    determinant = (
-        T[0, 0] * (T[1, 1] * T[2, 2] - T[1, 2] * T[2, 1])
-        - T[0, 1] * (T[1, 0] * T[2, 2] - T[1, 2] * T[2, 0])
-        + T[0, 2] * (T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0])
-    )
+    a, b = corner_of(vertices, faces, face, 0, T), corner_of(vertices, faces, face, 1, T)
+    c = corner_of(vertices, faces, face, 2, T)
+    s, t = closest_on_triangle(p, a, b, c)
+    away = minus(p, plus(plus(a, s, minus(b, a)), t, minus(c, a)))
+    normal = _pseudonormal(vertices, faces, corners, across, ring_start, ring, T, face, s, t)
+    determinant = dot((T[0, 0], T[1, 0], T[2, 0]), cross((T[0, 1], T[1, 1], T[2, 1]), (T[0, 2], T[1, 2], T[2, 2])))
+    return dot(away, normal) * determinant < 0.0
+
+
+@nb.njit(cache=True, nogil=True)
+def give_signs(points, vertices, faces, corners, across, ring_start, ring, T, chosen, nearest_faces, distances):
+    """Negate the (N,) distances of those of the (N, 3) points, `chosen` (K,), that are inside; see `is_inside`."""
     for i in chosen:
-        face = nearest_faces[i]
         p = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        a, b = _corner(vertices, faces, face, 0, T), _corner(vertices, faces, face, 1, T)
-        c = _corner(vertices, faces, face, 2, T)
-        s, t = closest_on_triangle(p, a, b, c)
-        u, v, away = _minus(b, a), _minus(c, a), _minus(p, a)
-        away = (
-            away[0] - s * u[0] - t * v[0],
-            away[1] - s * u[1] - t * v[1],
-            away[2] - s * u[2] - t * v[2],
-        )
-        normal = _pseudonormal(vertices, faces, corners, across, ring_start, ring, T, face, s, t)
-        if _dot(away, normal) * determinant < 0.0:
+        if is_inside(p, vertices, faces, corners, across, ring_start, ring, T, nearest_faces[i]):
             distances[i] = -distances[i]
