@@ -74,7 +74,7 @@ def mesh_distance(
     if not max_distance >= 0.0:
         raise InvalidValueError("max_distance", max_distance, ">= 0")
     found = _nearest(first, second, poses, float(max_distance))
-    if found is None and np.isfinite(max_distance) and _nested(first, second, poses):
+    if found is None and np.isfinite(max_distance) and _may_contain(first, second, poses):
         found = _nearest(first, second, poses, np.inf)
         found = found if found is not None and _contained(first, second, poses, found) else None
     if found is None:
@@ -83,7 +83,7 @@ def mesh_distance(
     square, points, _ = found
     if square == 0.0:
         deep = _depth(first, second, poses) if depth else 0.0
-        return MeshDistance(-deep, points[0], points[1], True)
+        return MeshDistance(0.0 - deep, points[0], points[1], True)
     sign = -1.0 if _contained(first, second, poses, found) else 1.0
     return MeshDistance(sign * float(np.sqrt(square)), points[0], points[1], False)
 
@@ -123,10 +123,12 @@ def _around(mesh: "TriangleMesh") -> tuple[Any, Any, Any, Any, Any, Any]:
     return mesh.vertices, mesh.faces, t.corners, t.across, t.ring_start, t.ring
 
 
-def _nested(first: "TriangleMesh", second: "TriangleMesh", poses: _Poses) -> bool:
-    """Whether the box of one, parallel to the map's axes, lies in that of the other: else none is inside the other."""
+def _may_contain(first: "TriangleMesh", second: "TriangleMesh", poses: _Poses) -> bool:
+    """Whether a closed mesh may hold the other: then its box, parallel to the map's axes, holds the other's."""
     (a, b), (c, d) = (_bounds(mesh, T) for mesh, T in zip((first, second), poses, strict=True))
-    return bool(((a >= c) & (b <= d)).all() or ((c >= a) & (d <= b)).all())
+    if ((a >= c) & (b <= d)).all():
+        return second.topology.closed
+    return bool(((c >= a) & (d <= b)).all()) and first.topology.closed
 
 
 def _bounds(mesh: "TriangleMesh", T: Float64) -> tuple[Float64, Float64]:
@@ -241,66 +243,9 @@ def _triangle(vertices, faces, face, T):
 
 
 @nb.njit(cache=True, nogil=True)
-def _search(
-    vertices_a, faces_a, boxes_a, members_a, T_a, vertices_b, faces_b, boxes_b, members_b, T_b, limit, points, faces
-):
-    """Squared distance of two surfaces within `limit`; writes the (2, 3) nearest points and their (2,) faces, or -1.
-
-    The trees are compared in the frame of the second mesh if its pose keeps lengths, where its boxes fit best.
-    """
-    rigid = _keeps_lengths(T_b)
-    A, B = (_times(_inverse(T_b), T_a), np.eye(4)) if rigid else (T_a, T_b)
-    leaves_a, leaves_b = members_a.shape[0], members_b.shape[0]
-    best = np.nextafter(limit * limit, np.inf)
-    faces[0], faces[1] = -1, -1
-    nodes, bounds = np.empty((_STACK, 2), np.int64), np.empty(_STACK)
-    nodes[0, 0], nodes[0, 1], bounds[0] = 1, 1, 0.0
-    waiting = 1
-    p, q = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    while waiting:
-        waiting -= 1
-        if bounds[waiting] >= best:
-            continue
-        a, b = nodes[waiting, 0], nodes[waiting, 1]
-        if a >= leaves_a and b >= leaves_b:
-            f, g = members_a[a - leaves_a], members_b[b - leaves_b]
-            square, x, y = between_triangles(_triangle(vertices_a, faces_a, f, A), _triangle(vertices_b, faces_b, g, B))
-            if square < best:
-                best, p, q, faces[0], faces[1] = square, x, y, f, g
-            continue
-        centre_a, half_a = _box(boxes_a, a, A)
-        centre_b, half_b = _box(boxes_b, b, B)
-        split_a = b >= leaves_b or (a < leaves_a and dot(half_a, half_a) >= dot(half_b, half_b))
-        if split_a:
-            left, half_left = _box(boxes_a, 2 * a, A)
-            right, half_right = _box(boxes_a, 2 * a + 1, A)
-            near, towards = _gap(left, half_left, centre_b, half_b)
-            far, away = _gap(right, half_right, centre_b, half_b)
-        else:
-            left, half_left = _box(boxes_b, 2 * b, B)
-            right, half_right = _box(boxes_b, 2 * b + 1, B)
-            near, towards = _gap(centre_a, half_a, left, half_left)
-            far, away = _gap(centre_a, half_a, right, half_right)
-        swap = near > far or (near == far and towards > away)
-        for k in range(2):  # the nearer one last, so that it comes first
-            other = (k == 0) != swap
-            bound = far if other else near
-            if bound < best:
-                nodes[waiting, 0] = 2 * a + other if split_a else a
-                nodes[waiting, 1] = b if split_a else 2 * b + other
-                bounds[waiting] = bound
-                waiting += 1
-    if rigid:
-        p, q = _moved(T_b, p), _moved(T_b, q)
-    for k in range(3):
-        points[0, k], points[1, k] = p[k], q[k]
-    return best
-
-
-@nb.njit(cache=True, nogil=True)
 def _nearest_face(p, vertices, faces, boxes, members, T):
-    """Squared distance of a point to a surface, and the nearest face."""
-    leaves, best, found = members.shape[0], np.inf, -1
+    """Squared distance of a point to a surface, the nearest face and the point on it."""
+    leaves, best, found, point = members.shape[0], np.inf, -1, p
     nodes, bounds = np.empty(_STACK, np.int64), np.empty(_STACK)
     nodes[0], bounds[0] = 1, 0.0
     waiting, nothing = 1, (0.0, 0.0, 0.0)
@@ -313,10 +258,11 @@ def _nearest_face(p, vertices, faces, boxes, members, T):
             face = members[node - leaves]
             a, b, c = _triangle(vertices, faces, face, T)
             s, t = closest_on_triangle(p, a, b, c)
-            away = minus(p, plus(plus(a, s, minus(b, a)), t, minus(c, a)))
+            x = plus(plus(a, s, minus(b, a)), t, minus(c, a))
+            away = minus(p, x)
             square = dot(away, away)
             if square < best:
-                best, found = square, face
+                best, found, point = square, face, x
             continue
         left, half_left = _box(boxes, 2 * node, T)
         right, half_right = _box(boxes, 2 * node + 1, T)
@@ -327,7 +273,125 @@ def _nearest_face(p, vertices, faces, boxes, members, T):
             if bound < best:
                 nodes[waiting], bounds[waiting] = 2 * node + other, bound
                 waiting += 1
-    return best, found
+    return best, found, point
+
+
+@nb.njit(cache=True, nogil=True)
+def _reach(boxes, node, T, n):
+    """How far a node's box after T reaches from its centre along the direction n."""
+    out = 0.0
+    for k in range(3):
+        half = 0.5 * (np.float64(boxes[node, 3 + k]) - boxes[node, k])
+        out += abs(n[0] * T[0, k] + n[1] * T[1, k] + n[2] * T[2, k]) * half
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _bound(boxes_a, a, A, boxes_b, b, B, direction, planes, best):
+    """Lower bound of the squared distance of what two nodes hold, and the squared distance of their centres.
+
+    That of their boxes, and if it is below `best`, the gaps along the direction of the nearest pair so far and along
+    the normals of the faces (`planes`, two) of nodes that are leaves, which tell more where surfaces fit closely.
+    """
+    centre_a, half_a = _box(boxes_a, a, A)
+    centre_b, half_b = _box(boxes_b, b, B)
+    bound, apart = _gap(centre_a, half_a, centre_b, half_b)
+    d = minus(centre_a, centre_b)
+    for n in (direction, planes[0], planes[1]):
+        if bound >= best:
+            break
+        gap = abs(dot(n, d)) - _reach(boxes_a, a, A, n) - _reach(boxes_b, b, B, n)
+        if gap > 0.0:
+            bound = max(bound, gap * gap)
+    return bound, apart
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _direction(a):
+    """Unit vector, or zero."""
+    length = np.sqrt(dot(a, a))
+    if not length > 0.0:
+        return 0.0, 0.0, 0.0
+    return a[0] / length, a[1] / length, a[2] / length
+
+
+@nb.njit(cache=True, nogil=True)
+def _plane(vertices, faces, members, node, T):
+    """Unit normal of the face of a leaf, zero of another node."""
+    leaves = members.shape[0]
+    if node < leaves:
+        return 0.0, 0.0, 0.0
+    a, b, c = _triangle(vertices, faces, members[node - leaves], T)
+    return _direction(cross(minus(b, a), minus(c, a)))
+
+
+@nb.njit(cache=True, nogil=True)
+def _near_pair(vertices_a, faces_a, boxes_a, members_a, A, vertices_b, faces_b, boxes_b, members_b, B):
+    """Faces of two surfaces that are near each other: to a point of one the nearest of the other, and so on."""
+    p, f, g = _box(boxes_a, 1, A)[0], -1, -1
+    for _ in range(3):
+        _, g, p = _nearest_face(p, vertices_b, faces_b, boxes_b, members_b, B)
+        _, f, p = _nearest_face(p, vertices_a, faces_a, boxes_a, members_a, A)
+    return f, g
+
+
+@nb.njit(cache=True, nogil=True)
+def _search(
+    vertices_a, faces_a, boxes_a, members_a, T_a, vertices_b, faces_b, boxes_b, members_b, T_b, limit, points, faces
+):
+    """Squared distance of two surfaces within `limit`; writes the (2, 3) nearest points and their (2,) faces, or -1.
+
+    The trees are compared in the frame of the second mesh if its pose keeps lengths, where its boxes fit best.
+    """
+    rigid = _keeps_lengths(T_b)
+    A, B = (_times(_inverse(T_b), T_a), np.eye(4)) if rigid else (T_a, T_b)
+    leaves_a, leaves_b = members_a.shape[0], members_b.shape[0]
+    best = np.nextafter(limit * limit, np.inf)
+    faces[0], faces[1] = -1, -1
+    p, q = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    if limit > 0.0:
+        f, g = _near_pair(vertices_a, faces_a, boxes_a, members_a, A, vertices_b, faces_b, boxes_b, members_b, B)
+        square, x, y = between_triangles(_triangle(vertices_a, faces_a, f, A), _triangle(vertices_b, faces_b, g, B))
+        if square < best:
+            best, p, q, faces[0], faces[1] = square, x, y, f, g
+    direction = _direction(minus(p, q))
+    nodes, bounds = np.empty((_STACK, 2), np.int64), np.empty(_STACK)
+    nodes[0, 0], nodes[0, 1], bounds[0] = 1, 1, 0.0
+    waiting = 1
+    while waiting:
+        waiting -= 1
+        if bounds[waiting] >= best:
+            continue
+        a, b = nodes[waiting, 0], nodes[waiting, 1]
+        if a >= leaves_a and b >= leaves_b:
+            f, g = members_a[a - leaves_a], members_b[b - leaves_b]
+            square, x, y = between_triangles(_triangle(vertices_a, faces_a, f, A), _triangle(vertices_b, faces_b, g, B))
+            if square < best:
+                best, p, q, faces[0], faces[1] = square, x, y, f, g
+                direction = _direction(minus(p, q))
+            continue
+        half_a, half_b = _box(boxes_a, a, A)[1], _box(boxes_b, b, B)[1]
+        split_a = b >= leaves_b or (a < leaves_a and dot(half_a, half_a) >= dot(half_b, half_b))
+        a0, a1, b0, b1 = (2 * a, 2 * a + 1, b, b) if split_a else (a, a, 2 * b, 2 * b + 1)
+        planes = (
+            _plane(vertices_a, faces_a, members_a, a, A),
+            _plane(vertices_b, faces_b, members_b, b, B),
+        )
+        near, towards = _bound(boxes_a, a0, A, boxes_b, b0, B, direction, planes, best)
+        far, away = _bound(boxes_a, a1, A, boxes_b, b1, B, direction, planes, best)
+        swap = near > far or (near == far and towards > away)
+        for k in range(2):  # the nearer one last, so that it comes first
+            other = (k == 0) != swap
+            bound = far if other else near
+            if bound < best:
+                nodes[waiting, 0], nodes[waiting, 1] = (a1, b1) if other else (a0, b0)
+                bounds[waiting] = bound
+                waiting += 1
+    if rigid:
+        p, q = _moved(T_b, p), _moved(T_b, q)
+    for k in range(3):
+        points[0, k], points[1, k] = p[k], q[k]
+    return best
 
 
 @nb.njit(cache=True, nogil=True)
@@ -340,7 +404,7 @@ def _deepest(points, T, vertices, faces, corners, across, ring_start, ring, boxe
         d = minus(p, centre)
         if abs(d[0]) > half[0] or abs(d[1]) > half[1] or abs(d[2]) > half[2]:
             continue
-        square, face = _nearest_face(p, vertices, faces, boxes, members, T_other)
+        square, face, _ = _nearest_face(p, vertices, faces, boxes, members, T_other)
         deeper = square > deepest * deepest
         if deeper and is_inside(p, vertices, faces, corners, across, ring_start, ring, T_other, face):
             deepest = np.sqrt(square)

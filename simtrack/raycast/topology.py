@@ -30,32 +30,43 @@ class Topology:
     @staticmethod
     def of(vertices: Float32, faces: npt.NDArray[np.uint32]) -> "Topology":
         """Topology of (V, 3) vertices and (F, 3) faces."""
-        _, places = np.unique(vertices + np.float32(0.0), axis=0, return_inverse=True)  # + 0: no negative zeros
-        corners = places.reshape(-1).astype(np.int32)[faces]
+        corners = _places(vertices)[faces]
         a, b, c = corners.T
         counts = (a != b) & (b != c) & (c != a)
         across = _across(corners, counts)
         around = corners[counts]
         owners = np.repeat(np.flatnonzero(counts).astype(np.int32), 3)
         order = np.argsort(around.reshape(-1), kind="stable")
-        start = np.searchsorted(around.reshape(-1)[order], np.arange(corners.max() + 2)).astype(np.int32)
+        sizes = np.bincount(around.reshape(-1), minlength=int(corners.max()) + 1)
+        start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
         closed = bool(counts.any() and (across[counts] >= 0).all())
         return Topology(corners, across, start, owners[order], closed)
 
 
+def _places(vertices: Float32) -> Int32:
+    """(V,) numbers that are equal for vertices at the same place."""
+    x, y, z = vertices.T
+    order = np.lexsort((z, y, x))
+    ordered = vertices[order]
+    new = np.concatenate([[False], (ordered[1:] != ordered[:-1]).any(axis=1)])
+    places = np.empty(len(vertices), np.int32)
+    places[order] = np.cumsum(new)
+    return places
+
+
 def _across(corners: Int32, counts: npt.NDArray[np.bool_]) -> Int32:
     """(F, 3), see `Topology.across`."""
-    here, there = corners.astype(np.int64), np.roll(corners, -1, axis=1).astype(np.int64)
-    places = int(corners.max()) + 1
-    edges, opposite = (here * places + there).reshape(-1), (there * places + here).reshape(-1)
+    here, there = corners.reshape(-1).astype(np.int64), np.roll(corners, -1, axis=1).reshape(-1).astype(np.int64)
+    edges = np.minimum(here, there) * (int(corners.max()) + 1) + np.maximum(here, there)
     used = np.flatnonzero(np.repeat(counts, 3))
     order = used[np.argsort(edges[used], kind="stable")]
-    keys = edges[order]
-    first, last = np.searchsorted(keys, opposite, "left"), np.searchsorted(keys, opposite, "right")
-    own = np.searchsorted(keys, edges, "right") - np.searchsorted(keys, edges, "left")
-    single = np.repeat(counts, 3) & (last - first == 1) & (own == 1)
+    starts = np.flatnonzero(np.diff(edges[order], prepend=-1))
+    pairs = starts[np.diff(starts, append=len(order)) == 2]
+    first, second = order[pairs], order[pairs + 1]
+    opposed = (here < there)[first] != (here < there)[second]
+    first, second = first[opposed], second[opposed]
     across = np.full(len(edges), -1, np.int32)
-    across[single] = order[first[single]] // 3
+    across[first], across[second] = second // 3, first // 3
     return across.reshape(-1, 3)
 
 
