@@ -42,8 +42,8 @@ class Points(NamedTuple):
     @classmethod
     def room(cls, count: int) -> "Points":
         """Empty buffers for `count` pairs."""
-        vectors = (np.empty((count, 3)) for _ in range(3))
-        return cls(*vectors, np.empty(count), np.empty(count, np.int32))
+        measured, model, normal = (np.empty((count, 3)) for _ in range(3))
+        return cls(measured, model, normal, np.empty(count), np.empty(count, np.int32))
 
 
 class Edges(NamedTuple):

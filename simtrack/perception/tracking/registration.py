@@ -278,7 +278,7 @@ class _Batch:
         """(K,), pixel grids; chosen once for a registration, so that iterations do not alternate."""
         count = len(self.instances)
         self.active, self.moved, self.deviations = np.ones(count, bool), np.zeros(count), np.zeros(count)
-        """(K,), takes part in the present iteration; how far its last one moved: surface metres, standard deviations."""
+        """(K,), takes part in the present iteration; how far the last one moved, metres of surface and deviations."""
         self.counts, self.edges = np.zeros((count, kernels.FIELDS), np.int64), np.zeros(count, np.int64)
         self.used = self.strides.copy()
         self.covariance, self.constrained = np.zeros((count, 6, 6)), np.zeros(count, np.int64)
