@@ -76,6 +76,7 @@ class ProgressLine:
         self._task = None
         self._what = ""
         self._said = -QUIET_PERIOD
+        self._told: set[str] = set()
 
     def __enter__(self) -> "ProgressLine":
         console = out()
@@ -87,10 +88,17 @@ class ProgressLine:
                 columns.insert(1, BarColumn(bar_width=None))  # type: ignore[arg-type]
             self._bar = Progress(*columns, console=console, transient=True, expand=True, refresh_per_second=8)
             self._bar.start()
-            self._task = self._bar.add_task(self._title, total=1.0, state="building the world")
-        else:
-            print(f"{self._title}: building the world", flush=True)
+            self._task = self._bar.add_task(self._title, total=1.0, state="")
+        self.say("building the world")
         return self
+
+    def say(self, what: str, thing: str = "") -> None:
+        """Tell what is being done before a run gets going; where there is no terminal, once each."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, state=f"{what}: {thing}" if thing else what)
+        elif what not in self._told:
+            self._told.add(what)
+            print(f"{self._title}: {what}", flush=True)
 
     def update(self, progress: "Progress") -> None:
         """Show how far a run is."""

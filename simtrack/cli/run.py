@@ -45,6 +45,7 @@ def run(
     from simtrack.cli import console
     from simtrack.evaluation.closed_loop import ClosedLoopRun
     from simtrack.evaluation.run_config import RunConfig
+    from simtrack.evaluation.start_up import cold_start_told, process_start
     from simtrack.report.page import write_report
     from simtrack.simulation.scene_file import load_scene
 
@@ -55,8 +56,8 @@ def run(
         overwrite=overwrite, log=log, compare_gaze=compare_gaze, threads=threads,
     )  # fmt: skip
     observers = _observers(view, rrd)
-    with console.ProgressLine(f"{loaded.name} · seed {seed}") as line:
-        record = ClosedLoopRun(config, on_progress=line.update, observers=observers).run()
+    with console.ProgressLine(f"{loaded.name} · seed {seed}") as line, cold_start_told(line.say):
+        record = ClosedLoopRun(config, line.update, observers, started=process_start()).run()
     write_report(record, folder / "report.html")
     _summarise(record)
     console.show_written(folder, ["metrics.json", "report.html"])

@@ -9,10 +9,11 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -33,15 +34,18 @@ from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, rat
 from simtrack.evaluation.record import RelationTimeline, RunRecord, graph_name
 from simtrack.evaluation.run_config import FIXED_GAZE, RunConfig
 from simtrack.evaluation.run_folder import EstimateTables, RunFolder, TruthTables
+from simtrack.evaluation.start_up import warm_up
 from simtrack.evaluation.tracking import TrackingEvaluator
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.objects import ObjectModel
 from simtrack.perception.pipeline import PerceptionStack
-from simtrack.recordings import McapWriter
 from simtrack.simulation.agents import AgentContext, make_agent
 from simtrack.simulation.oracles import OracleDetector
 from simtrack.simulation.randomness import stream
 from simtrack.simulation.simulation import Simulation
+
+if TYPE_CHECKING:
+    from simtrack.recordings import McapWriter
 
 SAVE_PERIOD = 5 * NANOSECONDS
 """Nanoseconds, simulated: metrics and graph are on disk at least this often."""
@@ -141,7 +145,7 @@ class Loop:
     """Held until the agent gives the first one."""
 
     def drive(
-        self, seconds: float, clock: Clock, log: McapWriter | None = None
+        self, seconds: float, clock: Clock, log: "McapWriter | None" = None
     ) -> Iterator[tuple[SensorFrame, Belief | None]]:
         """Run for so many simulated seconds; yields every frame as it arrives with what is believed after it.
 
@@ -201,6 +205,10 @@ class ClosedLoopRun:
     config: RunConfig
     on_progress: Callable[[Progress], None] = lambda progress: None
     observers: Sequence[Observer] = ()
+    started: float | None = None
+    """Seconds on the clock of `time.monotonic` from which the start-up counts; None: from `run` on."""
+    _start_up: float | None = None
+    """Seconds until the first image had been taken in."""
     _clock: Clock = field(default_factory=Clock)
     _stages: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     _timeline: RelationTimeline = field(default_factory=RelationTimeline)
@@ -218,8 +226,10 @@ class ClosedLoopRun:
             SimtrackError: something in the scene cannot be used.
         """
         config = self.config
+        self.started = time.monotonic() if self.started is None else self.started
         set_threads(config.threads)
         with ExitStack() as exits:
+            exits.enter_context(ThreadPoolExecutor(1)).submit(warm_up, opengl=config.renderer == "mujoco")
             stop = exits.enter_context(StopSignal())
             folder = RunFolder(config.out, config.overwrite)
             folder.write_config(config.resolved())
@@ -248,13 +258,15 @@ class ClosedLoopRun:
         return record
 
     def _watched(
-        self, loop: Loop, evaluator: Evaluator, folder: RunFolder, log: McapWriter | None, stop: StopSignal
+        self, loop: Loop, evaluator: Evaluator, folder: RunFolder, log: "McapWriter | None", stop: StopSignal
     ) -> Iterator[tuple[SensorFrame, Belief | None]]:
         """The frames of the loop until it ends or is stopped; shows them to observers and saves between them."""
         saved = -SAVE_PERIOD
         for frame, belief in loop.drive(self.config.seconds, self._clock, log):
             if isinstance(frame, RgbdFrame):
                 self._images += 1
+                if self._start_up is None and self.started is not None:
+                    self._start_up = time.monotonic() - self.started
                 if self._steady_from is None and frame.stamp >= WARM_UP:
                     self._steady_from = self._images, self._clock.loop, self._clock.total["evaluation"]
             yield frame, belief
@@ -324,6 +336,7 @@ class ClosedLoopRun:
         missing = "the run was too short"
         rate = ratio(self._images - images, spent, missing) if self._images > images else unmeasured("Hz", missing)
         metrics: Metrics = {"speed.frames_per_second": Metric(rate.value, "Hz", rate.reason)}
+        metrics["speed.start_up"] = Metric(self._start_up, "s", "" if self._start_up is not None else missing)
         stages = self.stage_seconds()
         for stage in sorted(stages):
             metrics[f"speed.stage.{stage}.median"] = quantile(stages[stage], 0.5, "s", missing)
@@ -365,8 +378,10 @@ class ClosedLoopRun:
 
 
 @contextmanager
-def open_log(config: RunConfig, loop: Loop) -> Iterator[McapWriter]:
+def open_log(config: RunConfig, loop: Loop) -> "Iterator[McapWriter]":
     """An MCAP log with all that a replay needs; the stack's detections go into it as they are answered."""
+    from simtrack.recordings import McapWriter
+
     assert config.log is not None
     simulation = loop.simulation
     metadata = {"scene": config.scene.name, "seed": config.seed, "T_map_base": simulation.start.ravel().tolist()}

@@ -54,11 +54,11 @@ class RelationEvaluator:
 
     def __init__(self, models: "Mapping[str, ObjectModel]", config: "RelationConfig | None" = None) -> None:
         """`models`: class name -> true model; `config`: the scene graph's thresholds."""
-        from simtrack.perception.scene_graph import RELATIONS, RelationConfig, model_shape
+        from simtrack.perception.scene_graph import RELATIONS, RelationConfig, model_shapes
 
         self._config = config or RelationConfig()
         self._symmetries = {name: model.symmetries for name, model in models.items()}
-        self._shapes = {name: model_shape(model) for name, model in models.items()}
+        self._shapes = model_shapes(models)
         self._counts = {name: _Counts() for name in RELATIONS}
         self._support = _Counts()
 

@@ -146,8 +146,10 @@ def split_by_color(mesh: Mesh) -> list[tuple[tuple[int, int, int], Mesh]]:
 
 def _scaled_normals(mesh: Mesh) -> Float64:
     """(F, 3), normals of twice the faces' areas in length."""
-    a, b, c = np.moveaxis(mesh.triangles, 1, 0)
-    return np.cross(b - a, c - a)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    u, v = (b - a).T, (c - a).T
+    # `np.cross` takes four times as long.
+    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]], axis=1)
 
 
 def face_normals(mesh: Mesh) -> Float64:

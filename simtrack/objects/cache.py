@@ -1,12 +1,14 @@
-"""Object models on disk: what takes seconds to build is built once a version and kept in the user's cache folder."""
+"""Models and meshes on disk: what takes long to build is built once a version and kept in the user's cache folder."""
 
 import hashlib
 import json
+import logging
 import os
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,47 +16,85 @@ from typing import Any
 import numpy as np
 
 from simtrack import paths
-from simtrack.geometry.meshes import Mesh
+from simtrack.geometry.meshes import Mesh, decimate
 from simtrack.objects.model import ObjectModel, Symmetries, SymmetryAxis
 
+_log = logging.getLogger("simtrack.cache")
+_UNUSABLE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
+"""What a file may raise that is missing, damaged or of another version."""
 _SCALARS = ("name", "semantic_class", "mass", "friction", "diameter", "trackable", "description")
 _ARRAYS = ("centre_of_mass", "inertia", "extents", "keypoints")
 
 
 def digest(*content: bytes) -> str:
     """Key of cached content: its hash together with the code and the libraries that make models."""
-    sha = hashlib.sha256()
-    here = Path(__file__).resolve().parent
-    for source in sorted([*here.rglob("*.py"), here.parent / "geometry" / "meshes.py"]):
-        sha.update(source.read_bytes())
-    for library in ("numpy", "manifold3d"):
-        sha.update(version(library).encode())
+    sha = hashlib.sha256(_makers())
     for part in content:
         sha.update(len(part).to_bytes(8, "little") + part)
     return sha.hexdigest()[:24]
 
 
+@cache
+def _makers() -> bytes:
+    """Hash of the code and the libraries."""
+    sha = hashlib.sha256()
+    here = Path(__file__).resolve().parent
+    for source in sorted([*here.rglob("*.py"), here.parent / "geometry" / "meshes.py"]):
+        sha.update(source.read_bytes())
+    for library in ("numpy", "manifold3d", "fast-simplification", "scipy"):
+        sha.update(version(library).encode())
+    return sha.digest()
+
+
 def cached_model(name: str, key: str, build: Callable[[], ObjectModel]) -> ObjectModel:
     """The model kept under `name` and `key`, else built and kept; a cache that cannot be used is no error."""
     path = paths.cache_dir() / "objects" / f"{name}-{key}.npz"
-    with suppress(OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+    with suppress(*_UNUSABLE):
         return _read(path)
+    _log.info("building object models: %s", name)
     model = build()
     with suppress(OSError):
-        _write(path, model)
+        _write(path, _pack(model))
     return model
 
 
-def _write(path: Path, model: ObjectModel) -> None:
-    """Write under another name, then rename: readers see all of the file or none."""
+def cached_decimation(name: str, mesh: Mesh, target_faces: int) -> Mesh:
+    """`simtrack.geometry.meshes.decimate`, its result kept under `name` and by what the mesh consists of."""
+    if target_faces >= len(mesh.faces):
+        return mesh
+    parts = [mesh.vertices, mesh.faces, *([] if mesh.face_colors is None else [mesh.face_colors])]
+    key = digest(*(part.tobytes() for part in parts), str(target_faces).encode())
+    path = paths.cache_dir() / "objects" / f"{name}-{target_faces}-{key}.npz"
+    with suppress(*_UNUSABLE), path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+        return _mesh(data, "mesh")
+    _log.info("simplifying object models: %s", name)
+    mesh = decimate(mesh, target_faces)
+    with suppress(OSError):
+        _write(path, _mesh_arrays("mesh", mesh))
+    return mesh
+
+
+def _pack(model: ObjectModel) -> Mapping[str, Any]:
     arrays: dict[str, Any] = {"scalars": np.array(json.dumps({k: getattr(model, k) for k in _SCALARS}))}
     arrays |= {k: getattr(model, k) for k in _ARRAYS}
     arrays["discrete"] = model.symmetries.discrete
     arrays["axes"] = np.array([[a.axis, a.offset] for a in model.symmetries.axes]).reshape(-1, 2, 3)
     for label, mesh in [("mesh", model.mesh), ("visual", model.visual), *_numbered(model.collision)]:
-        arrays[f"{label}.vertices"], arrays[f"{label}.faces"] = mesh.vertices, mesh.faces
-        if mesh.face_colors is not None:
-            arrays[f"{label}.colors"] = mesh.face_colors
+        arrays |= _mesh_arrays(label, mesh)
+    return arrays
+
+
+def _mesh_arrays(label: str, mesh: Mesh) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {f"{label}.vertices": mesh.vertices, f"{label}.faces": mesh.faces}
+    return arrays if mesh.face_colors is None else {**arrays, f"{label}.colors": mesh.face_colors}
+
+
+def _mesh(data: Mapping[str, np.ndarray], label: str) -> Mesh:
+    return Mesh(data[f"{label}.vertices"], data[f"{label}.faces"], data.get(f"{label}.colors"))
+
+
+def _write(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write under another name, then rename: readers see all of the file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
     try:
@@ -73,15 +113,10 @@ def _numbered(parts: tuple[Mesh, ...]) -> list[tuple[str, Mesh]]:
 def _read(path: Path) -> ObjectModel:
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
         parts = sum(1 for key in data.files if key.startswith("collision") and key.endswith(".faces"))
-
-        def mesh(label: str) -> Mesh:
-            colors = f"{label}.colors"
-            return Mesh(data[f"{label}.vertices"], data[f"{label}.faces"], data.get(colors))
-
         return ObjectModel(
-            mesh=mesh("mesh"),
-            visual=mesh("visual"),
-            collision=tuple(mesh(f"collision{i}") for i in range(parts)),
+            mesh=_mesh(data, "mesh"),
+            visual=_mesh(data, "visual"),
+            collision=tuple(_mesh(data, f"collision{i}") for i in range(parts)),
             symmetries=Symmetries(data["discrete"], tuple(SymmetryAxis(axis, offset) for axis, offset in data["axes"])),
             **{k: data[k] for k in _ARRAYS},
             **json.loads(str(data["scalars"])),

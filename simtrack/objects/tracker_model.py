@@ -48,18 +48,24 @@ def tracker_model(model: ObjectModel, config: TrackerModelConfig, rng: np.random
 
     `rng` is drawn from in the same way whatever the settings, so one setting does not change what another one draws.
     """
+    from simtrack.objects.cache import cached_decimation
+
     scale_draw, waves = rng.uniform(-1.0, 1.0), _SurfaceWaves.draw(rng)
-    mesh = meshes.decimate(model.mesh, round(config.face_share * len(model.mesh.faces)))
-    vertices = mesh.vertices
-    if config.noise > 0.0:
-        height = waves.at(vertices / config.correlation_length)
-        vertices = vertices + config.noise * height[:, None] * meshes.vertex_normals(mesh)
-    mesh = Mesh(vertices * (1.0 + config.max_scale_error * scale_draw), mesh.faces, mesh.face_colors)
+
+    def scanned(mesh: Mesh) -> Mesh:
+        vertices = mesh.vertices
+        if config.noise > 0.0:
+            height = waves.at(vertices / config.correlation_length)
+            vertices = vertices + config.noise * height[:, None] * meshes.vertex_normals(mesh)
+        return Mesh(vertices * (1.0 + config.max_scale_error * scale_draw), mesh.faces, mesh.face_colors)
+
+    lighter = cached_decimation(model.name, model.mesh, round(config.face_share * len(model.mesh.faces)))
+    mesh = scanned(lighter)
     extents = mesh.extents
     return replace(
         model,
         mesh=mesh,
-        visual=meshes.decimate(mesh, len(model.visual.faces)),
+        visual=scanned(cached_decimation(model.name, lighter, len(model.visual.faces))),
         collision=(),
         extents=extents,
         diameter=meshes.diameter(mesh),

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -150,10 +151,11 @@ class Simulation:
         if self._models is None:
             config = configured(TrackerModelConfig, self.scene.tracker_models, self.scene, "tracker_models")
             exact = {self.world.objects[thing.id].name: self.world.objects[thing.id] for thing in self.scene.objects}
-            self._models = {
-                name: tracker_model(model, config, stream(self.seed, f"tracker model {name}"))
-                for name, model in sorted(exact.items())
-            }
+            names = sorted(exact)
+            streams = [stream(self.seed, f"tracker model {name}") for name in names]
+            with ThreadPoolExecutor() as workers:
+                made = workers.map(tracker_model, (exact[name] for name in names), repeat(config), streams)
+                self._models = dict(zip(names, made, strict=True))
         return self._models
 
     @property

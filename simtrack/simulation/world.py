@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from simtrack.contracts import Float64, Int32
+from simtrack.contracts import Float64, Int32, Uint8
 from simtrack.errors import FileFormatError, InvalidValueError, UnknownNameError
 from simtrack.geometry.kinematics import KinematicTree, Link
 from simtrack.geometry.meshes import Mesh, area, painted
@@ -124,9 +124,9 @@ class _Composer:
         """Compile; every face samples one texel, so that colours are exact and no texture is ever filtered."""
         import mujoco
 
-        colors = [np.unique(mesh.face_colors, axis=0) for _, mesh in self._colored if mesh.face_colors is not None]
-        palette = np.unique(np.concatenate([*colors, np.full((1, 3), 200, np.uint8)]), axis=0)
-        keys = palette.astype(np.int64) @ (65536, 256, 1)
+        used = [np.unique(_color_keys(mesh.face_colors), return_inverse=True) for _, mesh in self._colored]
+        keys = np.unique(np.concatenate([*(own for own, _ in used), _color_keys(np.full((1, 3), 200, np.uint8))]))
+        palette = np.stack([keys >> 16, keys >> 8 & 255, keys & 255], axis=1).astype(np.uint8)
         texture = self.spec.add_texture(
             name="palette", type=mujoco.mjtTexture.mjTEXTURE_2D, width=len(palette), height=1, nchannel=3
         )
@@ -134,11 +134,8 @@ class _Composer:
         material = self.spec.add_material(name="palette", specular=0.1, shininess=0.2)
         material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "palette"
         texcoords = np.stack([(np.arange(len(palette)) + 0.5) / len(palette), np.full(len(palette), 0.5)], axis=1)
-        for asset, mesh in self._colored:
-            assert mesh.face_colors is not None
-            index = np.searchsorted(keys, mesh.face_colors.astype(np.int64) @ (65536, 256, 1))
-            used, local = np.unique(index, return_inverse=True)
-            asset.usertexcoord = texcoords[used].ravel()  # type: ignore[attr-defined]
+        for (asset, _), (own, local) in zip(self._colored, used, strict=True):
+            asset.usertexcoord = texcoords[np.searchsorted(keys, own)].ravel()  # type: ignore[attr-defined]
             asset.userfacetexcoord = np.repeat(local, 3).astype(np.int32)  # type: ignore[attr-defined]
         return self.spec.compile()
 
@@ -296,10 +293,18 @@ def _add_object(composer: _Composer, name: str, model: ObjectModel, T_map_object
     composer.instances.append((name, kind, f"object/{name}", model.mesh, identity))
 
 
+def _color_keys(colors: Uint8 | None) -> np.ndarray:
+    """(F,) numbers that order colours (F, 3) as their channels do; single numbers are found faster than rows."""
+    assert colors is not None
+    return colors.astype(np.int32) @ np.array([65536, 256, 1], np.int32)
+
+
 def _same_surface(a: Mesh, b: Mesh) -> bool:
     """Whether one mesh is a mere retessellation of the other (then the lighter one can stand for both)."""
-    same_box = np.allclose(a.bounds, b.bounds, rtol=0.0, atol=1e-6)
-    return bool(same_box) and abs(area(a) - area(b)) <= 1e-5 * area(b)
+    if not np.allclose(a.bounds, b.bounds, rtol=0.0, atol=1e-6):
+        return False
+    whole = area(b)
+    return abs(area(a) - whole) <= 1e-5 * whole
 
 
 def _add_robot(composer: _Composer, robot: KinematicTree, fovy: float) -> None:
@@ -365,8 +370,7 @@ def _settled(
     }
     controller = RobotController(model, robot, {**TUCKED, **joints}, TIMESTEP_NS * 1e-9)
     controller.place(data, *start)
-    for _ in range(round(SETTLE_SECONDS / (TIMESTEP_NS * 1e-9))):
-        mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, nstep=round(SETTLE_SECONDS / (TIMESTEP_NS * 1e-9)))
     controller.place(data, *start)
     data.qvel[:] = 0.0
     data.time = 0.0

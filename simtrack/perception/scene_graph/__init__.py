@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         box_shape,
         map_entity_shape,
         model_shape,
+        model_shapes,
     )
 
 _HOME = {
@@ -40,7 +41,16 @@ _HOME = {
     "history": ("Event", "History", "Interval"),
     "query": ("Query", "parse_query"),
     "relations": ("DIRECTIONS", "RELATIONS", "RelationConfig", "relation_margin", "relation_margins"),
-    "shapes": ("HeightField", "Interior", "ModelLike", "Shape", "box_shape", "map_entity_shape", "model_shape"),
+    "shapes": (
+        "HeightField",
+        "Interior",
+        "ModelLike",
+        "Shape",
+        "box_shape",
+        "map_entity_shape",
+        "model_shape",
+        "model_shapes",
+    ),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
 
@@ -66,6 +76,7 @@ __all__ = [
     "load_graph",
     "map_entity_shape",
     "model_shape",
+    "model_shapes",
     "parse_query",
     "relation_margin",
     "relation_margins",

@@ -23,7 +23,7 @@ from simtrack.perception.scene_graph.motion import NONE, Motion, stacked
 from simtrack.perception.scene_graph.pairs import PairTable
 from simtrack.perception.scene_graph.relations import RELATIONS, RelationConfig
 from simtrack.perception.scene_graph.rooms import RoomIndex
-from simtrack.perception.scene_graph.shapes import ModelLike, Shape, map_entity_shape, model_shape
+from simtrack.perception.scene_graph.shapes import ModelLike, Shape, map_entity_shape, model_shapes
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class SceneGraph(SceneFacts):
         )
         self.status = Status.OK
         """How the last update fared: DEGRADED if a track's pose was not finite, STALE if its stamp was not newer."""
-        self._model_shapes = {name: model_shape(model) for name, model in models.items()}
+        self._model_shapes = model_shapes(models)
         self._arrays = BodyArrays({f"model:{name}": shape for name, shape in self._model_shapes.items()}, rules)
         capacity = len(self._arrays.alive)
         self._pairs = PairTable()

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import os
 import tempfile
 import zipfile
@@ -18,6 +19,7 @@ from simtrack.contracts import Float64, MapEntity, Room, StaticMap
 from simtrack.geometry.meshes import Mesh
 from simtrack.simulation.building.parts import StaticPart, StaticWorld
 
+_log = logging.getLogger("simtrack.cache")
 Arrays: TypeAlias = dict[str, np.ndarray]
 Posed: TypeAlias = Sequence[tuple[Float64, Float64]]
 """(T (4, 4), size (k,)) pairs: supports or collision boxes."""
@@ -51,6 +53,7 @@ def cached_world(key: str, build: Callable[[], StaticWorld]) -> StaticWorld:
     path = paths.cache_dir() / "buildings" / f"{key}.npz"
     with suppress(OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return _unpack_world(_read(path))
+    _log.info("building the office floor")
     world = build()
     with suppress(OSError):
         _write(path, _pack_world(world))
@@ -62,6 +65,7 @@ def cached_map(key: str, build: Callable[[], StaticMap]) -> StaticMap:
     path = paths.cache_dir() / "surveys" / f"{key}.npz"
     with suppress(OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return _unpack_map(_read(path))
+    _log.info("surveying the building")
     static_map = build()
     with suppress(OSError):
         _write(path, _pack_map(static_map))
