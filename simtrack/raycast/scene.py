@@ -222,6 +222,8 @@ class RayScene:
             return
         with self._lock:
             self._open()
+            if not self._dirty:  # another thread was first
+                return
             if self._motions_changed:
                 self._table.set_motions(self._motions)
             if not self.fallback:
