@@ -48,7 +48,7 @@ class Replay:
         recording = open_recording(self._recording)
         if recording.static_map is None or recording.robot is None:
             raise FileFormatError(self._recording, "attachments", "no map or no robot is recorded to replay with")
-        start = _start_pose(recording.metadata, self._recording)
+        start = start_pose(recording.metadata, self._recording)
         with ExitStack() as exits:
             stop = exits.enter_context(StopSignal())
             folder = RunFolder(self._out, self._overwrite)
@@ -103,7 +103,7 @@ class Replay:
         return metrics
 
 
-def _start_pose(metadata: Mapping[str, object], path: Path) -> Float64 | None:
+def start_pose(metadata: Mapping[str, object], path: Path) -> Float64 | None:
     """The pose that the operator stated for the robot's start, None if the recording has none."""
     stated = metadata.get("T_map_base")
     if stated is None:

@@ -155,11 +155,11 @@ def erase(pixels, images):
 @njit(cache=True, nogil=True)
 def point_correspondences(
     pixels, directions, distances, normals, rows, readings, width, strides, gate, sigma, model_sigma, pixel_noise,
-    lateral, points, counts,
+    lateral, origin, points, start, counts,
 ):  # fmt: skip
-    """Pair measured points with model points along the viewing rays; returns the number of pairs.
+    """Pair measured points with model points along the viewing rays; returns the number of pairs, earlier ones too.
 
-    Camera or lidar: a ray's point is its distance times its direction.
+    Camera or lidar: a ray's point is its distance times its direction from the sensor's origin.
 
     Args:
         pixels: (N,) index of each ray's reading.
@@ -175,12 +175,15 @@ def point_correspondences(
         model_sigma: surface error of the models, metres.
         pixel_noise: focal length times baseline of a depth camera, px m.
         lateral: standard deviation across the ray in multiples of the distance.
+        origin: (3,) of the rays, in the frame of `directions` and `normals`.
         points: output.
+        start: row of `points` to fill first.
         counts: (K, FIELDS) output, rays by verdict, added to.
 
     """
     measured, model, normal, weight, owner = points
-    found = 0
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    found = start
     for i in range(pixels.shape[0]):
         k = rows[i]
         if k < 0 or k >= strides.shape[0]:
@@ -210,8 +213,8 @@ def point_correspondences(
             continue
         across = lateral * z
         noise = variance * along * along + across * across * (1.0 - cosine * cosine) + model_sigma * model_sigma
-        measured[found, 0], measured[found, 1], measured[found, 2] = d * x, d * y, d * w
-        model[found, 0], model[found, 1], model[found, 2] = z * x, z * y, z * w
+        measured[found, 0], measured[found, 1], measured[found, 2] = ox + d * x, oy + d * y, oz + d * w
+        model[found, 0], model[found, 1], model[found, 2] = ox + z * x, oy + z * y, oz + z * w
         normal[found, 0], normal[found, 1], normal[found, 2] = nx, ny, nz
         weight[found], owner[found] = 1.0 / noise, k
         found += 1

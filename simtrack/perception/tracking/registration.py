@@ -240,7 +240,7 @@ class Registration:
         pairs = kernels.point_correspondences(
             pixels, bundle.directions, hits.distances, hits.normals, rows, batch.depth.reshape(-1),
             batch.depth.shape[1], strides, step.gate, 0.0, config.model_sigma, config.focal_baseline,
-            0.4 / batch.camera[0], self._points, batch.counts,
+            0.4 / batch.camera[0], np.zeros(3), self._points, 0, batch.counts,
         )  # fmt: skip
         edge_pairs = 0
         if step.silhouettes != "never":
