@@ -1,6 +1,5 @@
 """A scene of mesh instances: cast rays at it, ask what is occluded and what lies nearest."""
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from threading import RLock
@@ -12,16 +11,15 @@ import numpy.typing as npt
 from simtrack.contracts import Bool, Float32, Float64, Int32
 from simtrack.errors import InvalidValueError, RaycastError
 from simtrack.raycast import embree as rtc
-from simtrack.raycast import fallback, instancing, kernels
+from simtrack.raycast import fallback, kernels
 from simtrack.raycast.bundle import RayBundle
+from simtrack.raycast.hierarchy import Hierarchy
 from simtrack.raycast.hits import ClosestPoints, RayHits
 from simtrack.raycast.mesh import TriangleMesh
 from simtrack.raycast.table import InstanceTable, checked_pose, checked_poses
 
 MAX_INSTANCE = 1 << 21
 """Instance ids are below this: tables are indexed by them."""
-_MAX_LISTED = 256
-"""Kernels look at instances one by one, to see which rays may meet them, up to this number of them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,20 +58,9 @@ class RayScene:
         self._motions: dict[int, Float64] = {}
         self._table = InstanceTable()
         self._lock = RLock()
-        self._dirty = self._members_changed = True
-        self._motions_changed = self._ground_stale = False
+        self._dirty, self._motions_changed, self._closed = True, False, False
         self._first_free = 0
-        self._top = 0
-        self._ground: int | None = None
-        self._others = np.zeros(0, np.int32)
-        self._world: tuple[object, ...] = ()
-        self._closed = False
-        if not self.fallback:
-            api = rtc.embree().api
-            self._top = api.rtcNewScene(rtc.embree().device)
-            api.rtcSetSceneFlags(self._top, rtc.RTC_SCENE_FLAG_DYNAMIC)
-            rtc.embree().check("rtcNewScene")
-            self._release = weakref.finalize(self, api.rtcReleaseScene, self._top)
+        self._hierarchy = None if self.fallback else Hierarchy(self._meshes, self._motions, self._table)
 
     # ------------------------------------------------------------------------------------------------ what is in it
 
@@ -132,15 +119,15 @@ class RayScene:
                 if number in self._meshes or not 0 <= number < MAX_INSTANCE or len(new) < len(instances):
                     allowed = f"0..{MAX_INSTANCE - 1}, each once, and not one of {self.instances}"
                     raise InvalidValueError("instance", number, allowed)
-            if not self.fallback:
+            if self._hierarchy:
                 for mesh in meshes:
                     _ = mesh.scene_handle  # raises, if it cannot be built, before anything has changed
             numbers = np.array(instances, np.int64)
-            self._ground_stale |= self._table.add(numbers, meshes, poses)
+            self._table.add(numbers, meshes, poses)
             self._meshes.update(zip(instances, meshes, strict=True))
-            if not self.fallback:
-                self._attach(numbers)
-            self._members_changed = self._dirty = True
+            if self._hierarchy:
+                self._hierarchy.attach(numbers)
+            self._dirty = True
 
     def remove(self, instance: int) -> None:
         """Take an instance out; its id becomes free, the others keep theirs."""
@@ -150,16 +137,14 @@ class RayScene:
         """Take several instances out at once, see `remove`. If one is unknown, none is taken out."""
         with self._lock:
             numbers = np.array([self._known(instance) for instance in dict.fromkeys(instances)], np.int64)
-            self._detach(numbers)
-            self._ground = None if self._ground in numbers else self._ground
-            table = self._table
-            self._ground_stale |= bool(table.unmoved[numbers].any())
-            table.enabled[numbers] = table.unmoved[numbers] = False
+            if self._hierarchy:
+                self._hierarchy.detach(numbers)
+            self._table.remove(numbers)
             for number in numbers.tolist():
                 self._motions_changed |= self._motions.pop(number, None) is not None
                 del self._meshes[number]
                 self._first_free = min(self._first_free, number)
-            self._members_changed = self._dirty = True
+            self._dirty = True
 
     def set_pose(self, instance: int, T_map_mesh: npt.ArrayLike) -> None:
         """Move an instance to the (4, 4) affine transform `T_map_mesh` and end any motion of it."""
@@ -175,11 +160,9 @@ class RayScene:
             if self._motions:
                 for instance in instances:
                     self._motions_changed |= self._motions.pop(instance, None) is not None
-            self._ground_stale |= self._table.place(numbers, poses)
-            if not self.fallback:
-                geometries = self._table.handles[numbers]
-                held = geometries != 0
-                instancing.move(geometries[held], instancing.columns(poses[held]))
+            self._table.place(numbers, poses)
+            if self._hierarchy:
+                self._hierarchy.move(numbers)
             self._dirty = True
 
     def set_motion(self, instance: int, T_keys: npt.ArrayLike) -> None:
@@ -197,20 +180,20 @@ class RayScene:
             self.set_poses((instance,), keys[:1])
             if len(keys) > 1:
                 self._motions[instance] = keys
-                self._ground_stale |= bool(self._table.unmoved[instance])
-                self._table.unmoved[instance] = False
+                self._table.set_off(instance)
                 self._motions_changed = True
-                self._tell_motion(instance)
+                if self._hierarchy:
+                    self._hierarchy.set_off(instance)
 
     def set_enabled(self, instance: int, enabled: bool) -> None:
         """Show an instance to rays and queries, or hide it."""
         with self._lock:
-            number, table = self._known(instance), self._table
-            if table.enabled[number] != enabled:
-                table.enabled[number] = enabled
-                self._show(number)
-                self._ground_stale |= bool(table.unmoved[number])
-                self._members_changed = self._dirty = True
+            number = self._known(instance)
+            if self._table.enabled[number] != enabled:
+                self._table.enable(number, enabled)
+                if self._hierarchy:
+                    self._hierarchy.show(number)
+                self._dirty = True
 
     def commit(self) -> None:
         """Make changes effective; casting does it by itself where needed.
@@ -226,9 +209,9 @@ class RayScene:
                 return
             if self._motions_changed:
                 self._table.set_motions(self._motions)
-            if not self.fallback:
-                self._commit()
-            self._dirty = self._members_changed = self._motions_changed = self._ground_stale = False
+            if self._hierarchy:
+                self._hierarchy.commit()
+            self._dirty = self._motions_changed = False
 
     # ------------------------------------------------------------------------------------------------------ queries
 
@@ -259,7 +242,7 @@ class RayScene:
         T = checked_pose(T_map_sensor, "T_map_sensor")
         self.commit()
         hits = RayHits.reuse(out, len(bundle))
-        if self.fallback:
+        if self._hierarchy is None:
             rays = bundle.directions @ T[:3, :3].astype(np.float32).T
             origins = np.broadcast_to(T[:3, 3].astype(np.float32), rays.shape)
             limits = np.float32(min_distance), np.float32(max_distance)
@@ -267,7 +250,7 @@ class RayScene:
         elif len(bundle):
             lanes, output = (0,) * bundle.packed.shape[2], (hits.distances, hits.normals, hits.faces, hits.instances)
             rays = bundle.packed, bundle.order, bundle.cones, T, float(time), float(min_distance), float(max_distance)
-            arguments = (lanes, *self._world, *rays, -1 if coherent is None else int(coherent), *output)
+            arguments = (lanes, *self._hierarchy.world, *rays, -1 if coherent is None else int(coherent), *output)
             kernels.run(len(bundle), kernels.cast_bundle, kernels.cast_bundle_parallel, *arguments)
         return hits
 
@@ -297,12 +280,14 @@ class RayScene:
         rays = _checked_rays(origins, directions, times, packing)
         self.commit()
         hits = RayHits.reuse(out, len(rays[0]))
-        if self.fallback:
+        if self._hierarchy is None:
             fallback.cast(self._posed(), *rays[:3], np.float32(min_distance), np.float32(max_distance), hits)
         elif len(rays[0]):
             lanes, output = (0,) * rtc.embree().packet_width, (hits.distances, hits.normals, hits.faces, hits.instances)
             arguments = (*rays, float(min_distance), float(max_distance), packing is not None, *output)
-            kernels.run(len(rays[0]), kernels.cast_rays, kernels.cast_rays_parallel, lanes, *self._world, *arguments)
+            kernels.run(
+                len(rays[0]), kernels.cast_rays, kernels.cast_rays_parallel, lanes, *self._hierarchy.world, *arguments
+            )
         return hits
 
     def occluded(
@@ -318,14 +303,14 @@ class RayScene:
         rays = _checked_rays(origins, directions, times, None)
         limit = np.ascontiguousarray(np.broadcast_to(np.asarray(distances, np.float32), (len(rays[0]),)))
         self.commit()
-        if self.fallback:
+        if self._hierarchy is None:
             hits = RayHits.empty(len(limit))
             fallback.cast(self._posed(), *rays[:3], np.float32(min_distance), np.float32(np.inf), hits)
             return hits.distances < limit
         blocked = np.zeros(len(limit), np.bool_)
         if len(limit):
             lanes = (0,) * rtc.embree().packet_width
-            arguments = (lanes, *self._world[:2], *rays, float(min_distance), limit, blocked)
+            arguments = (lanes, *self._hierarchy.world[:2], *rays, float(min_distance), limit, blocked)
             kernels.run(len(limit), kernels.occluded, kernels.occluded_parallel, *arguments)
         return blocked
 
@@ -351,14 +336,16 @@ class RayScene:
         self.commit()
         count = len(queries)
         found = ClosestPoints.empty(count)
-        if self.fallback:
+        if self._hierarchy is None:
             fallback.closest(self._posed(), queries, max_distance, found)
         elif count:
             from simtrack.raycast import closest
 
             output = (found.points, found.distances, found.instances, found.faces)
             arguments = (closest.CALLBACK, queries, float(max_distance), self._table.buffers, self._table.poses)
-            kernels.run(16 * count, closest.closest, closest.closest_parallel, *self._world[:3], *arguments, *output)
+            kernels.run(
+                16 * count, closest.closest, closest.closest_parallel, *self._hierarchy.world[:3], *arguments, *output
+            )
         if signed:
             self._give_signs(queries, found)
         return found
@@ -368,8 +355,8 @@ class RayScene:
     def close(self) -> None:
         """Release the scene; using it afterwards raises RaycastError."""
         with self._lock:
-            if not self._closed and not self.fallback:
-                self._release()
+            if self._hierarchy:
+                self._hierarchy.release()
             self._closed = True
             self._meshes.clear()
 
@@ -409,72 +396,6 @@ class RayScene:
             number: Instance(mesh, self._motions.get(number, poses[number : number + 1]), bool(enabled[number]))
             for number, mesh in self._meshes.items()
         }
-
-    def _attach(self, numbers: npt.NDArray[np.int64]) -> None:
-        """Put instances into Embree's hierarchy."""
-        table, geometries = self._table, np.zeros(len(numbers), np.int64)
-        scenes = np.array([self._meshes[number].scene_handle for number in numbers.tolist()], np.int64)
-        columns = instancing.columns(table.poses[numbers])
-        instancing.place(rtc.embree().device, self._top, scenes, numbers, columns, geometries)
-        rtc.embree().check("rtcAttachGeometryByID")
-        table.handles[numbers] = geometries
-        for number in numbers[~table.enabled[numbers]].tolist():
-            self._show(number)
-        for number in self._motions.keys() & set(numbers.tolist()):
-            self._tell_motion(number)
-
-    def _detach(self, numbers: npt.NDArray[np.int64]) -> None:
-        held = numbers[self._table.handles[numbers] != 0]
-        if len(held):
-            self._table.handles[held] = 0
-            instancing.detach(self._top, held)
-            rtc.embree().check("rtcDetachGeometry")
-
-    def _show(self, number: int) -> None:
-        geometry = int(self._table.handles[number])
-        if geometry:
-            api = rtc.embree().api
-            (api.rtcEnableGeometry if self._table.enabled[number] else api.rtcDisableGeometry)(geometry)
-            api.rtcCommitGeometry(geometry)
-
-    def _tell_motion(self, number: int) -> None:
-        geometry, keys = int(self._table.handles[number]), self._motions[number]
-        if geometry:
-            api = rtc.embree().api
-            api.rtcSetGeometryTimeStepCount(geometry, len(keys))
-            for step, key in enumerate(keys):
-                columns = np.ascontiguousarray(key[:3].T, np.float32)
-                layout = rtc.RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR
-                api.rtcSetGeometryTransform(geometry, step, layout, columns.ctypes.data)
-            api.rtcCommitGeometry(geometry)
-
-    def _commit(self) -> None:
-        if self._ground_stale:
-            self._choose_ground()
-        table = self._table
-        if self._members_changed or self._ground_stale:
-            shown = table.enabled.copy()
-            if self._ground is not None:
-                shown[self._ground] = False
-            self._others = np.flatnonzero(shown).astype(np.int32)
-        rtc.embree().api.rtcCommitScene(self._top)
-        rtc.embree().check("rtcCommitScene")
-        ground = (0, -1) if self._ground is None else (self._meshes[self._ground].scene_handle, self._ground)
-        listed = self._others if len(self._others) <= _MAX_LISTED else self._others[:0]
-        self._world = (self._top if len(self._others) else 0, *ground, listed, table.rows, table.motion, table.keys)
-
-    def _choose_ground(self) -> None:
-        """The largest enabled instance at the identity leaves the hierarchy of instances; what was there returns."""
-        table = self._table
-        candidates = np.flatnonzero(table.enabled & table.unmoved)
-        best = int(candidates[np.argmax(table.rows[candidates, 12])]) if len(candidates) else None
-        if best == self._ground:
-            return
-        former, self._ground = self._ground, best
-        if former is not None and former in self._meshes and not table.handles[former]:
-            self._attach(np.array([former]))
-        if best is not None:
-            self._detach(np.array([best]))
 
 
 def _checked_rays(

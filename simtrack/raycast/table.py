@@ -40,6 +40,10 @@ class InstanceTable:
         """(M,), of instances that exist."""
         self.unmoved: Bool = np.zeros(0, np.bool_)
         """(M,), whether the pose is the identity, exactly, and at rest."""
+        self.members_changed = True
+        """Whether instances were added, removed, shown or hidden; reset by who has looked."""
+        self.ground_stale = False
+        """Whether such an instance, or one that came to or left its place, stands at the identity; likewise."""
 
     def reserve(self, number: int) -> None:
         """Make room for an instance id."""
@@ -53,18 +57,37 @@ class InstanceTable:
             new[:have] = old
             setattr(self, name, new)
 
-    def add(self, numbers: npt.NDArray[np.int64], meshes: Sequence["TriangleMesh"], poses: Float64) -> bool:
-        """Enter new instances, enabled and at rest; returns what `place` does."""
+    def add(self, numbers: npt.NDArray[np.int64], meshes: Sequence["TriangleMesh"], poses: Float64) -> None:
+        """Enter new instances, enabled and at rest."""
         self.reserve(int(numbers.max()))
         self.spheres[numbers] = [(*mesh.bounding_sphere[0], mesh.bounding_sphere[1]) for mesh in meshes]
         self.buffers[numbers] = [(mesh.vertices.ctypes.data, mesh.faces.ctypes.data) for mesh in meshes]
         self.rows[numbers, 13] = [len(mesh.faces) for mesh in meshes]
         self.handles[numbers], self.enabled[numbers], self.unmoved[numbers] = 0, True, False
-        return self.place(numbers, poses)
+        self.members_changed = True
+        self.place(numbers, poses)
 
-    def place(self, numbers: npt.NDArray[np.int64], poses: Float64) -> bool:
-        """Put instances to rest at (N, 4, 4) valid poses; returns whether one has come to, or left, the identity."""
-        return bool(_place(numbers, poses, self.poses, self.spheres, self.rows, self.motion, self.unmoved))
+    def remove(self, numbers: npt.NDArray[np.int64]) -> None:
+        """Strike instances out."""
+        self.members_changed = True
+        self.ground_stale |= bool(self.unmoved[numbers].any())
+        self.enabled[numbers] = self.unmoved[numbers] = False
+
+    def enable(self, number: int, enabled: bool) -> None:
+        """Show or hide an instance."""
+        self.members_changed = True
+        self.ground_stale |= bool(self.unmoved[number])
+        self.enabled[number] = enabled
+
+    def place(self, numbers: npt.NDArray[np.int64], poses: Float64) -> None:
+        """Put instances to rest at (N, 4, 4) valid poses."""
+        arrays = self.poses, self.spheres, self.rows, self.motion, self.unmoved
+        self.ground_stale |= bool(_place(numbers, poses, *arrays))
+
+    def set_off(self, number: int) -> None:
+        """Note that an instance moves; its keys come with `set_motions`."""
+        self.ground_stale |= bool(self.unmoved[number])
+        self.unmoved[number] = False
 
     def set_motions(self, motions: Mapping[int, Float64]) -> None:
         """Fill `keys` and `motion` for the instances that move, by id (K, 4, 4), and bound all of their way."""

@@ -6,8 +6,7 @@ import trimesh
 
 from simtrack.contracts import CameraIntrinsics
 from simtrack.geometry.transforms import exp_so3, look_at, transform
-from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
-from simtrack.raycast import scene as scenes
+from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh, hierarchy
 
 CAMERA = CameraIntrinsics(160, 120, 110.0, 110.0, 79.5, 59.5)
 ROOM = trimesh.creation.box((8.0, 6.0, 3.0)).subdivide().subdivide()
@@ -88,9 +87,9 @@ def test_culling_loses_no_hit_of_many_instances_near_or_far(monkeypatch: pytest.
                 for T in placed(100, seed=6):
                     T[:3, 3] += offset
                     world.add(ball, T)
-            monkeypatch.setattr(scenes, "_MAX_LISTED", 1000)
+            monkeypatch.setattr(hierarchy, "_MAX_LISTED", 1000)
             scene.commit()
-            monkeypatch.setattr(scenes, "_MAX_LISTED", 0)
+            monkeypatch.setattr(hierarchy, "_MAX_LISTED", 0)
             asks_all.commit()
             for _ in range(5):
                 T = transform(exp_so3(rng.normal(size=3)), offset + rng.uniform(-1, 1, 3))
