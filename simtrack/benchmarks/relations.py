@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import count
+from itertools import count, cycle
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +112,7 @@ def run(options: Options) -> Benchmark:
         ten = _measure_updates(world, graph, options.quick)["ten move"]
         name = f"{ASKED_SIZE} objects in {LARGE_FLOOR} rooms, {MOVING} move: simtrack"
         result.add(name, ten, asked=asked, note=_extent(world, graph))
+        result.add("distance of two neighbours' surfaces: simtrack", _measure_surfaces(world, graph))
     result.series = curves
     result.plots = {"relations.svg": lambda path: _plot(curves, path)}
     return result
@@ -144,6 +145,13 @@ def _measure_updates(world: World, graph: SceneGraph, quick: bool) -> dict[str, 
     repeats = 5 if quick else 60
     ten = measure(few, repeats, warmup=5, before=lambda: follow(MOVING))
     return ten | measure(every, max(3, repeats // 6), before=lambda: follow(len(world.poses)))
+
+
+def _measure_surfaces(world: World, graph: SceneGraph) -> Timing:
+    """The distance of the meshes of neighbours, on demand."""
+    names = [f"{name}-{number + 1}" for number, name in enumerate(world.classes)]
+    pairs = cycle(zip(names[MOVING : MOVING + 9], names[MOVING + 1 : MOVING + 10], strict=True))
+    return measure({"surfaces": lambda: graph.mesh_distance(*next(pairs))}, repeats=45, warmup=9)["surfaces"]
 
 
 def boxes(posed: Sequence[tuple[Float64, Float64]]) -> tuple[Float64, Float64, Float64]:

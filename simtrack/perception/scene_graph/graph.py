@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import chain, compress
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,11 @@ from simtrack.perception.scene_graph.pairs import PairTable
 from simtrack.perception.scene_graph.relations import RELATIONS, RelationConfig
 from simtrack.perception.scene_graph.rooms import RoomIndex
 from simtrack.perception.scene_graph.shapes import ModelLike, Shape, map_entity_shape, model_shapes
+
+if TYPE_CHECKING:
+    from simtrack.perception.scene_graph.surfaces import Surfaces
+    from simtrack.raycast import TriangleMesh
+    from simtrack.raycast.distance import MeshDistance
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +114,8 @@ class SceneGraph(SceneFacts):
         self._room = np.full(capacity, NONE)
         self._static: dict[int, MapEntity] = {}
         self._table: dict[str, Entity] | None = None
+        self._sources = static_map, models
+        self._surfaces: Surfaces | None = None
         if static_map is not None:
             self._add_static_map(static_map)
 
@@ -292,6 +300,34 @@ class SceneGraph(SceneFacts):
         if child not in self._slots:
             raise UnknownNameError("object", child, self._slots)
         return self._motion.carried_pose(self._slots[child])
+
+    def mesh_distance(self, a: str, b: str, max_distance: float = np.inf, *, depth: bool = False) -> "MeshDistance":
+        """Distance of the surfaces of two entities at their current poses; `distance` is that of their boxes.
+
+        Surfaces are those of the models and, for static entities, what the survey shows within their boxes. They are
+        made at the first question that needs them.
+
+        Args:
+            a: name of an object or a static entity.
+            b: likewise.
+            max_distance: metres; what is farther apart is not looked for.
+            depth: measure how deep surfaces that cross are in one another.
+
+        Raises:
+            UnknownNameError: one of them does not exist now, or is a room.
+        """
+        from simtrack.raycast.distance import mesh_distance
+
+        T_a, T_b = self.body(a).T_map, self.body(b).T_map
+        return mesh_distance(self._surface(a), T_a, self._surface(b), T_b, max_distance, depth=depth)
+
+    def _surface(self, name: str) -> "TriangleMesh":
+        from simtrack.perception.scene_graph.surfaces import Surfaces
+
+        if self._surfaces is None:
+            self._surfaces = Surfaces(*self._sources)
+        class_name, _, layer = self.known[name]
+        return self._surfaces.of_model(class_name) if layer is Layer.OBJECT else self._surfaces.of_entity(name)
 
     def body(self, name: str) -> Body:
         """Shape and pose of a static entity or an object."""

@@ -123,6 +123,27 @@ def _neighbours(world, slots, moved, shift):
 
 
 @njit(cache=True, nogil=True)
+def _may_face(world, a, b, parameters, limit):
+    """Whether the sphere of a, which is not near b, reaches into one of the six regions of b."""
+    if world.layout[a] or world.layout[b]:
+        return False
+    if not parameters.projection:
+        return True
+    aside = 0
+    beyond = 0
+    for axis in range(3):
+        t = 0.0
+        for k in range(3):
+            t += world.rotations[b, k, axis] * (world.centres[a, k] - world.centres[b, k])
+        half = world.halves[b, axis]
+        outside = abs(t) - world.radii[a] - limit
+        aside += outside > half
+        beyond += outside > half * (1.0 + 2.0 * parameters.projection_factor)
+    # A region lies along one axis: beside the box along two axes is beside all regions.
+    return aside < 2 and beyond == 0
+
+
+@njit(cache=True, nogil=True)
 def _evaluate(world, pairs, keys, masks, parameters):
     """Renew the masks of both orders of pairs (P, 2); returns the changes (N, 4) and how many keys came in."""
     centres, reach, radii = world.centres, world.reach, world.radii
@@ -150,7 +171,7 @@ def _evaluate(world, pairs, keys, masks, parameters):
             place = _find(keys, a, b)
             old = masks[place]
             new = 0
-            if near:
+            if near and (distance <= far or _may_face(world, a, b, parameters, limit)):
                 pair_margins(world, a, b, distance, parameters, limit, t, e, margins)
                 new = _refreshed(old, margins, parameters)
             if new == old:

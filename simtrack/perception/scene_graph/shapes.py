@@ -208,8 +208,8 @@ def _rasterise(points, faces, size, nu, nv):
     lowest = np.full((nu, nv), np.inf)
     cells = np.empty_like(points)  # in cells from the grid's corner, heights as they are
     for v in range(points.shape[0]):
-        cells[v, 0] = (points[v, 0] / size[0] + 0.5) * nu
-        cells[v, 1] = (points[v, 1] / size[1] + 0.5) * nv
+        cells[v, 0] = (points[v, 0] + 0.5 * size[0]) / (size[0] / nu)
+        cells[v, 1] = (points[v, 1] + 0.5 * size[1]) / (size[1] / nv)
         cells[v, 2] = points[v, 2]
     for f in range(faces.shape[0]):
         for k in range(3):

@@ -200,6 +200,34 @@ EXACT = SceneGraphConfig(
 )
 
 
+def test_surfaces_are_farther_apart_than_boxes(graph: SceneGraph, track: TrackMaker) -> None:
+    """A relay in the middle of a tub: within its box, and 8 cm from its walls."""
+    relay = on_bench(RELAY + 0.03)
+    graph.update(1, [track("tub", 1, on_bench(TUB), 1), track("relay", 2, relay, 1)])
+    assert graph.distance("tub-1", "relay-2").signed < 0.0
+    found = graph.mesh_distance("tub-1", "relay-2")
+    assert found.distance == pytest.approx(0.02, abs=1e-6)  # above the floor of the tub, which is 1 cm thick
+    assert not found.crossing
+    assert graph.mesh_distance("relay-2", "workbench").distance == pytest.approx(0.03, abs=1e-6)
+    assert graph.mesh_distance("relay-2", "shelf", max_distance=0.5).distance == np.inf
+    graph.update(2, [track("tub", 1, on_bench(TUB), 2), track("relay", 2, on_bench(RELAY, y=0.16), 2)])
+    assert graph.mesh_distance("tub-1", "relay-2").crossing
+    with pytest.raises(UnknownNameError, match="workbench"):
+        graph.mesh_distance("relay-2", "lab")
+    with pytest.raises(UnknownNameError, match="workbench"):
+        graph.mesh_distance("banana", "relay-2")
+
+
+def test_static_surfaces_are_what_the_survey_shows(static_map: StaticMap, models: Models, track: TrackMaker) -> None:
+    """Of the bench only a board at 0.7 m was surveyed, and beside it something else."""
+    board = np.array([[-0.5, -1, 0.7], [0.5, -1, 0.7], [0.5, 1, 0.7], [-0.5, 1, 0.7]])
+    vertices = np.concatenate([board, board + (5.0, 0.0, 0.0)]).astype(np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.int32)
+    graph = SceneGraph(replace(static_map, vertices=vertices, faces=faces), models)
+    graph.update(1, [track("relay", 1, on_bench(RELAY), 1)])
+    assert graph.mesh_distance("relay-1", "workbench").distance == pytest.approx(0.1, abs=1e-6)
+
+
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_incremental_equals_from_scratch(static_map: StaticMap, models: Models, track: TrackMaker, seed: int) -> None:
