@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from simtrack.evaluation.closed_loop import Observer
+    from simtrack.evaluation.closed_loop import Observer, Progress
     from simtrack.evaluation.record import RunRecord
 
 
@@ -42,10 +42,12 @@ def run(
         rrd: Save the run for rerun in this file (needs the extra viz).
         threads: Threads of the compiled kernels; all cores if not given.
     """
+    from simtrack.evaluation.start_up import cold_start_told, process_start, relax_collector
+
+    restore_collector = relax_collector()
     from simtrack.cli import console
     from simtrack.evaluation.closed_loop import ClosedLoopRun
     from simtrack.evaluation.run_config import RunConfig
-    from simtrack.evaluation.start_up import cold_start_told, process_start
     from simtrack.report.page import write_report
     from simtrack.simulation.scene_file import load_scene
 
@@ -57,7 +59,12 @@ def run(
     )  # fmt: skip
     observers = _observers(view, rrd)
     with console.ProgressLine(f"{loaded.name} · seed {seed}") as line, cold_start_told(line.say):
-        record = ClosedLoopRun(config, line.update, observers, started=process_start()).run()
+
+        def show(progress: "Progress") -> None:
+            restore_collector()
+            line.update(progress)
+
+        record = ClosedLoopRun(config, show, observers, started=process_start()).run()
     write_report(record, folder / "report.html")
     _summarise(record)
     console.show_written(folder, ["metrics.json", "report.html"])

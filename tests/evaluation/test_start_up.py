@@ -1,5 +1,6 @@
 """How long a start takes is counted from the process's, and what makes it slow is told."""
 
+import gc
 import subprocess
 import sys
 import time
@@ -10,7 +11,7 @@ import pytest
 from numba import njit
 
 from simtrack import paths
-from simtrack.evaluation.start_up import cold_start_told, process_start, warm_up
+from simtrack.evaluation.start_up import cold_start_told, process_start, relax_collector, warm_up
 from simtrack.geometry.meshes import Mesh, cylinder_mesh, subdivide_to
 from simtrack.objects.cache import cached_decimation
 
@@ -75,6 +76,14 @@ def test_a_light_mesh_and_a_damaged_file_are_no_trouble(empty_cache: Path) -> No
     found = cached_decimation("drum", mesh, 500)
     np.testing.assert_array_equal(found.vertices, expected.vertices)
     assert isinstance(found, Mesh)
+
+
+def test_the_collector_works_as_before_once_a_start_is_over() -> None:
+    thresholds = gc.get_threshold()
+    restore = relax_collector()
+    assert gc.get_threshold()[0] > thresholds[0]
+    restore()
+    assert gc.get_threshold() == thresholds
 
 
 def test_warming_up_needs_no_opengl() -> None:
