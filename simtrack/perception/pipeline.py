@@ -6,7 +6,7 @@ the belief's status and keeps its state.
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -267,7 +267,7 @@ class PerceptionStack:
         if result is not None and self.on_detection is not None:
             self.on_detection(result)
 
-    def _relate(self, stamp: int, tracked: TrackerResult) -> frozenset[Relation]:
+    def _relate(self, stamp: int, tracked: TrackerResult) -> Set[Relation]:
         return self.graph.update(stamp, tracked.tracks)
 
     # ---------------------------------------------------------------------------------------------------------- support
