@@ -7,12 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import numpy.typing as npt
 
 from simtrack.contracts import Float64, Int32, Uint8
 from simtrack.errors import InvalidValueError, MeshError
+
+_SIMPLIFYING = Lock()
+"""`fast_simplification` keeps its mesh in global variables and lets other threads run meanwhile."""
 
 MAX_FILE_BYTES = 200_000_000
 """Largest mesh file that `load_mesh` reads."""
@@ -346,7 +350,9 @@ def decimate(mesh: Mesh, target_faces: int) -> Mesh:
         return mesh
     import fast_simplification
 
-    points, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=max(int(target_faces), 4))[:2]
+    count = max(int(target_faces), 4)
+    with _SIMPLIFYING:
+        points, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=count)[:2]
     out = Mesh(points, faces.astype(np.int32))
     if mesh.face_colors is None:
         return out

@@ -1,5 +1,6 @@
 """Laws of meshes: masses, tessellation, sampling, reading."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -225,3 +226,14 @@ def test_damaged_files_are_mesh_errors(
         assert "mesh" in str(error) and suffix in str(error)
     else:
         meshes.validate(mesh, file)
+
+
+def test_meshes_can_be_decimated_by_several_threads() -> None:
+    round_ones = [trimesh.creation.icosphere(subdivisions=k) for k in (3, 4, 5)] * 3
+    spheres = [Mesh(np.asarray(s.vertices, np.float64), np.asarray(s.faces, np.int32)) for s in round_ones]
+    alone = [meshes.decimate(sphere, len(sphere.faces) // 2) for sphere in spheres]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda sphere: meshes.decimate(sphere, len(sphere.faces) // 2), spheres))
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+        np.testing.assert_array_equal(one.faces, other.faces)
