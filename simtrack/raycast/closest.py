@@ -62,14 +62,13 @@ def closest_on_triangle(p, a, b, c):
 
 
 @nb.njit(cache=True, nogil=True)
-def _corner(vertices, index, poses, instance):
-    """Vertex in the map frame, as a tuple."""
+def _corner(vertices, index, pose):
+    """Vertex under a (16,) pose, as a tuple."""
     x, y, z = vertices[3 * index], vertices[3 * index + 1], vertices[3 * index + 2]
-    row = 16 * instance
     return (
-        poses[row] * x + poses[row + 1] * y + poses[row + 2] * z + poses[row + 3],
-        poses[row + 4] * x + poses[row + 5] * y + poses[row + 6] * z + poses[row + 7],
-        poses[row + 8] * x + poses[row + 9] * y + poses[row + 10] * z + poses[row + 11],
+        pose[0] * x + pose[1] * y + pose[2] * z + pose[3],
+        pose[4] * x + pose[5] * y + pose[6] * z + pose[7],
+        pose[8] * x + pose[9] * y + pose[10] * z + pose[11],
     )
 
 
@@ -100,25 +99,24 @@ def search(points, corners, instance, out):
 def _nearer(arguments: Any) -> Any:
     """RTCPointQueryFunction: measure one triangle in the map frame and shrink the query if it is the nearest so far.
 
-    The map frame serves rigid, scaled, sheared and mirrored instances alike. `userPtr` leads to six int64: instance and
-    face found, addresses of the buffers' table, of the poses, and of four float64 (squared distance, point), and the
-    instance that a mesh has which is queried by itself.
+    The map frame serves rigid, scaled, sheared and mirrored instances alike. `userPtr` leads to seven int64: instance
+    and face found, addresses of the buffers' table, of the poses, and of four float64 (squared distance, point), then
+    the instance of a mesh that is queried by itself, in its own frame, and the address of an identity pose.
     """
     words = carray(pointer(arguments), 5, np.int64)  # query, userPtr, primitive | geometry, context, scale
-    state = carray(pointer(words[1]), 6, np.int64)
+    state = carray(pointer(words[1]), 7, np.int64)
     best = carray(pointer(state[4]), 4, np.float64)
     query = carray(pointer(words[0]), 5, np.float32)
-    instance = np.int64(carray(pointer(words[3]), 36, np.int32)[32])
-    if instance < 0:
-        instance = state[5]
+    met = np.int64(carray(pointer(words[3]), 36, np.int32)[32])
+    instance = met if met >= 0 else state[5]
     face = words[2] & 0xFFFFFFFF
     buffers = carray(pointer(state[2] + 16 * instance), 2, np.int64)
-    poses = carray(pointer(state[3]), 16 * (instance + 1), np.float64)
+    pose = carray(pointer(state[3] + 128 * met if met >= 0 else state[6]), 16, np.float64)
     corners = carray(pointer(buffers[1] + 12 * face), 3, np.uint32)
     vertices = carray(pointer(buffers[0]), 1 << 40, np.float32)  # the true length is not needed
-    a = _corner(vertices, np.int64(corners[0]), poses, instance)
-    b = _corner(vertices, np.int64(corners[1]), poses, instance)
-    c = _corner(vertices, np.int64(corners[2]), poses, instance)
+    a = _corner(vertices, np.int64(corners[0]), pose)
+    b = _corner(vertices, np.int64(corners[1]), pose)
+    c = _corner(vertices, np.int64(corners[2]), pose)
     p = (np.float64(query[0]), np.float64(query[1]), np.float64(query[2]))
     s, t = closest_on_triangle(p, a, b, c)
     x = a[0] + s * (b[0] - a[0]) + t * (c[0] - a[0])
@@ -139,41 +137,59 @@ CALLBACK: int = _callback.address
 
 
 @nb.njit(cache=True, nogil=True)
+def _moved(T, x, y, z):
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+
+
+@nb.njit(cache=True, nogil=True)
 def _chunk(chunk, scenes, callback, points, limit, buffers, poses, out):
-    others, ground, ground_id = scenes
+    others, ground, ground_id, T_ground_map = scenes
     found_points, distances, instances, faces = out
     # RTCPointQuery, RTCPointQueryContext (two 4x4 matrices, instance id, instance primitive, stack size), our state.
     raw = np.zeros(128, np.float32)
     aligned = raw[(-raw.ctypes.data % 64) // 4 :]
     query, context = aligned[:16], aligned[16:64]
     context_words = context.view(np.uint32)
-    state, best = np.zeros(6, np.int64), np.zeros(4, np.float64)
+    state, best, identity = np.zeros(7, np.int64), np.zeros(4, np.float64), np.eye(4)
     state[2], state[3], state[4], state[5] = buffers.ctypes.data, poses.ctypes.data, best.ctypes.data, ground_id
+    state[6] = identity.ctypes.data
     for i in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, points.shape[0])):
-        query[0], query[1], query[2], query[3], query[4] = points[i, 0], points[i, 1], points[i, 2], 0.0, limit
         best[0] = np.float64(limit) * np.float64(limit)
         state[0], state[1] = -1, -1
         context_words[32], context_words[33], context_words[34] = 0xFFFFFFFF, 0, 0
         if np.isfinite(points[i, 0] + points[i, 1] + points[i, 2]):
-            for scene in (others, ground):
-                if scene:
-                    _rtcPointQuery(scene, query.ctypes.data, context.ctypes.data, callback, state.ctypes.data)
+            if others:
+                query[0], query[1], query[2], query[3], query[4] = points[i, 0], points[i, 1], points[i, 2], 0.0, limit
+                _rtcPointQuery(others, query.ctypes.data, context.ctypes.data, callback, state.ctypes.data)
+            if ground:
+                query[0], query[1], query[2] = _moved(T_ground_map, points[i, 0], points[i, 1], points[i, 2])
+                query[3], query[4] = 0.0, np.sqrt(best[0])
+                _rtcPointQuery(ground, query.ctypes.data, context.ctypes.data, callback, state.ctypes.data)
+                if state[0] == ground_id:
+                    best[1], best[2], best[3] = _moved(poses[ground_id], best[1], best[2], best[3])
         instances[i], faces[i] = state[0], state[1]
         distances[i] = np.sqrt(best[0]) if state[0] >= 0 else np.inf
         for axis in range(3):
             found_points[i, axis] = best[1 + axis] if state[0] >= 0 else points[i, axis]
+    return identity[0, 0]
 
 
 @nb.njit(cache=True, nogil=True)
 def closest(
-    others, ground, ground_id, callback, points, limit, buffers, poses, found_points, distances, instances, faces
-):
+    others, ground, ground_id, T_ground_map, callback, points, limit, buffers, poses,
+    found_points, distances, instances, faces,
+):  # fmt: skip
     """Nearest points of (N, 3) float32 `points` within `limit`, on the calling thread; see `kernels.World`.
 
     Args:
         others: address of the scene of instances, or 0.
-        ground: address of the scene of the mesh that stands at the identity, or 0.
+        ground: address of the scene of the mesh that is queried by itself, or 0.
         ground_id: its instance id.
+        T_ground_map: (4, 4) inverse of its pose, which keeps lengths.
         callback: `CALLBACK`.
         points: the queries.
         limit: metres.
@@ -186,14 +202,19 @@ def closest(
     """
     out = found_points, distances, instances, faces
     for chunk in range((points.shape[0] + _CHUNK - 1) // _CHUNK):
-        _chunk(chunk, (others, ground, ground_id), callback, points, np.float32(limit), buffers, poses, out)
+        _chunk(
+            chunk, (others, ground, ground_id, T_ground_map), callback, points, np.float32(limit), buffers, poses, out
+        )
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def closest_parallel(
-    others, ground, ground_id, callback, points, limit, buffers, poses, found_points, distances, instances, faces
-):
+    others, ground, ground_id, T_ground_map, callback, points, limit, buffers, poses,
+    found_points, distances, instances, faces,
+):  # fmt: skip
     """`closest` on numba's threads."""
     out = found_points, distances, instances, faces
     for chunk in nb.prange((points.shape[0] + _CHUNK - 1) // _CHUNK):
-        _chunk(chunk, (others, ground, ground_id), callback, points, np.float32(limit), buffers, poses, out)
+        _chunk(
+            chunk, (others, ground, ground_id, T_ground_map), callback, points, np.float32(limit), buffers, poses, out
+        )

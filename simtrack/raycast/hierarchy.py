@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtrack.contracts import Float64
+from simtrack.geometry.transforms import inverse
 from simtrack.raycast import embree as rtc
 from simtrack.raycast import instancing
 from simtrack.raycast.mesh import TriangleMesh
@@ -14,6 +15,8 @@ from simtrack.raycast.table import InstanceTable
 
 _MAX_LISTED = 256
 """Kernels look at instances one by one, to see which rays may meet them, up to this number of them."""
+_MUCH_LARGER = 2.0
+"""Times the bounding radius of the next largest instance from which on an instance is the ground."""
 
 
 class Hierarchy:
@@ -98,31 +101,37 @@ class Hierarchy:
             RaycastError: Embree could not build the hierarchy, or refused one of the changes.
         """
         table = self._table
-        if table.ground_stale:
+        if table.members_changed:
             self._choose_ground()
-        if table.members_changed or table.ground_stale:
             others = table.enabled.copy()
             if self._ground is not None:
                 others[self._ground] = False
             self._others = np.flatnonzero(others).astype(np.int32)
         rtc.embree().api.rtcCommitScene(self._top)
         rtc.embree().check("rtcCommitScene")
-        table.members_changed = table.ground_stale = False
-        ground = (0, -1) if self._ground is None else (self._meshes[self._ground].scene_handle, self._ground)
+        table.members_changed = False
+        ground, T_ground_map = (0, -1), np.eye(4)
+        if self._ground is not None:
+            ground = self._meshes[self._ground].scene_handle, self._ground
+            T_ground_map = inverse(table.poses[self._ground])
         listed = self._others if len(self._others) <= _MAX_LISTED else self._others[:0]
-        self.world = (self._top if len(self._others) else 0, *ground, listed, table.rows, table.motion, table.keys)
+        tables = listed, table.rows, table.motion, table.keys
+        self.world = (self._top if len(self._others) else 0, *ground, T_ground_map, *tables)
 
     def _choose_ground(self) -> None:
-        """The largest enabled instance at the identity leaves the RTCScene; what was the ground returns to it."""
+        """An instance much larger than all others leaves the RTCScene, if it is rigid; what was the ground returns."""
         table = self._table
-        candidates = np.flatnonzero(table.enabled & table.unmoved)
-        best = int(candidates[np.argmax(table.rows[candidates, 12])]) if len(candidates) else None
-        if best == self._ground:
+        radii = np.where(table.enabled, table.rows[:, 12], np.float32(0.0))
+        best = int(np.argmax(radii)) if len(radii) else -1
+        ground = None
+        if best >= 0 and table.enabled[best] and table.rigid[best]:
+            largest, radii[best] = radii[best], 0.0
+            ground = best if largest > _MUCH_LARGER * radii.max() else None
+        if ground == self._ground:
             return
-        former, self._ground = self._ground, best
+        former, self._ground = self._ground, ground
         if former is not None:
             self.attach(np.array([former]))
-        if best is not None:
-            held = np.array([best])
-            instancing.detach(self._top, held)
-            table.handles[held] = 0
+        if ground is not None:
+            instancing.detach(self._top, np.array([ground]))
+            table.handles[ground] = 0

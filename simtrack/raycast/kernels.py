@@ -2,9 +2,9 @@
 
 Every output element is written from one packet only, so the results do not depend on the number of threads.
 
-A scene is two hierarchies (see `World`): the ground, traced directly, and the other instances. Groups of packets whose
-cone meets no other instance's sphere trace the ground alone, and packets keep together only where that pays: rays that
-meet a triangle each are traced faster one by one.
+A scene is two hierarchies (see `World`): the ground, traced in its own frame, and the other instances. Groups of
+packets whose cone meets no other instance's sphere trace the ground alone, and packets keep together only where that
+pays: rays that meet a triangle each are traced faster one by one.
 
 What Python calls takes plain arrays and numbers, because numba takes named tuples apart slowly, and hands them to the
 chunks as plain tuples, because parallel loops do not know the names.
@@ -17,7 +17,7 @@ import numba as nb
 import numpy as np
 
 from simtrack.raycast import packets
-from simtrack.raycast.vector import any_within, carray, fill_float, pointer, rotate
+from simtrack.raycast.vector import any_within, carray, pointer, rotate
 
 GROUP = 8
 """Packets of a bundle that share a cone."""
@@ -43,7 +43,9 @@ class World(NamedTuple):
     ground: int
     """Address of the ground's own RTCScene, 0 without a ground."""
     ground_id: int
-    """Instance id of the ground, which stands at the identity."""
+    """Instance id of the ground, -1 without one."""
+    T_ground_map: np.ndarray
+    """(4, 4) float64, rigid."""
     listed: np.ndarray
     """(L,) int32, ids of the other instances, or empty: there may be any number, anywhere."""
     rows: np.ndarray
@@ -65,6 +67,8 @@ class Bundle(NamedTuple):
     """(B / GROUP, 6) float32, sensor frame: axis, and of the half opening angle cosine, sine and 1 - cosine."""
     pose: np.ndarray
     """(3, 4) float32, map from sensor."""
+    ground_pose: np.ndarray
+    """(3, 4) float32, ground's mesh from sensor."""
     time: np.float32
 
 
@@ -183,17 +187,17 @@ def _bundle_chunk(chunk, lanes, world_fields, bundle_fields, discs, near, far, t
     width, world, bundle = len(lanes), World(*world_fields), Bundle(*bundle_fields)
     packet, integers, valid = packets.new_packet(lanes, near, bundle.time)
     arguments = packets.arguments()
-    others, ground, ground_id, _, rows, motion, keys = world_fields
+    others, ground, ground_id, _, _, rows, motion, keys = world_fields
     # Addresses as numbers; the arrays live until the end of the function because it returns something of them.
     p_valid, p_packet, p_together = packets.address(valid), packets.address(packet), packets.address(arguments)
     p_alone, p_pose = p_together + 64, packets.address(bundle.pose)
+    p_ground_pose, apart = packets.address(bundle.ground_pose), (bundle.ground_pose != bundle.pose).any()
     p_packed, p_order = packets.address(bundle.packed), packets.address(bundle.order)
     p_rows, p_motion = packets.address(rows), packets.address(motion)
     p_distances, p_normals, p_faces, p_instances = out
     p_discs, met = packets.address(discs), np.empty(discs.shape[0], np.int64)
     blocks, cones = bundle.packed.shape[0], bundle.cones
-    for axis in range(3):
-        fill_float(lanes, p_packet + 4 * axis * width, bundle.pose[axis, 3])
+    packets.stand(lanes, p_packet, p_pose)
     for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, blocks), GROUP):
         flags, count = _to_trace(world, cones, first // GROUP, discs, GROUP * width, met)
         if together >= 0:
@@ -203,15 +207,33 @@ def _bundle_chunk(chunk, lanes, world_fields, bundle_fields, discs, near, far, t
             packets.announce(lanes, block, rays, p_distances, p_normals, p_faces, p_instances)
             packets.reset(lanes, p_packet, far)
             directions = p_packed + 12 * block * width
-            rotate(lanes, p_pose, directions, p_packet + 16 * width)
-            if flags & _OTHERS and _any_meets(lanes, directions, p_discs, met, count):
+            aimed = flags & _OTHERS and _any_meets(lanes, directions, p_discs, met, count)
+            if aimed:
+                if apart:
+                    packets.stand(lanes, p_packet, p_pose)
+                rotate(lanes, p_pose, directions, p_packet + 16 * width)
                 packets.intersect(lanes, p_valid, others, p_packet, p_together if flags & _OTHERS_COHERENT else p_alone)
             if flags & _GROUND:
+                if apart:
+                    packets.stand(lanes, p_packet, p_ground_pose)
+                if apart or not aimed:
+                    rotate(lanes, p_ground_pose, directions, p_packet + 16 * width)
                 packets.intersect(lanes, p_valid, ground, p_packet, p_together if flags & _GROUND_COHERENT else p_alone)
             if not packets.turn_alike(lanes, p_packet, ground_id, p_rows, p_motion):
                 packets.turn_mixed(lanes, packet, integers, ground_id, rows, motion, keys)
             packets.write(lanes, p_packet, rays, p_distances, p_normals, p_faces, p_instances)
     return valid[0] + np.int32(arguments[0, 0]) + np.int32(discs[0, 0])
+
+
+@nb.njit(cache=True, nogil=True)
+def _product(A, B):
+    """(3, 4) float32, the upper rows of the product of two affine (4, 4)."""
+    out = np.empty((3, 4), np.float32)
+    for i in range(3):
+        for j in range(4):
+            value = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+            out[i, j] = value + (A[i, 3] if j == 3 else 0.0)
+    return out
 
 
 @nb.njit(cache=True, nogil=True)
@@ -227,13 +249,14 @@ def _chunks(order, lanes):
 
 @nb.njit(cache=True, nogil=True)
 def cast_bundle(
-    lanes, others, ground, ground_id, listed, rows, motion, keys,
+    lanes, others, ground, ground_id, T_ground_map, listed, rows, motion, keys,
     packed, order, cones, T_map_sensor, time, near, far, together, distances, normals, faces, instances,
 ):  # fmt: skip
     """Nearest hits of a bundle, on the calling thread; `together` is 1 or 0 for `coherent`, -1 to decide by group."""
-    world = others, ground, ground_id, listed, rows, motion, keys
-    pose = T_map_sensor[:3].astype(np.float32)
-    bundle, out = (packed, order, cones, pose, np.float32(time)), _addresses(distances, normals, faces, instances)
+    world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
+    pose, ground_pose = T_map_sensor[:3].astype(np.float32), _product(T_ground_map, T_map_sensor)
+    bundle = packed, order, cones, pose, ground_pose, np.float32(time)
+    out = _addresses(distances, normals, faces, instances)
     discs = _discs(World(*world), pose)
     for chunk in range(_chunks(order, lanes)):
         _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, out)
@@ -241,13 +264,14 @@ def cast_bundle(
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def cast_bundle_parallel(
-    lanes, others, ground, ground_id, listed, rows, motion, keys,
+    lanes, others, ground, ground_id, T_ground_map, listed, rows, motion, keys,
     packed, order, cones, T_map_sensor, time, near, far, together, distances, normals, faces, instances,
 ):  # fmt: skip
     """`cast_bundle` on numba's threads."""
-    world = others, ground, ground_id, listed, rows, motion, keys
-    pose = T_map_sensor[:3].astype(np.float32)
-    bundle, out = (packed, order, cones, pose, np.float32(time)), _addresses(distances, normals, faces, instances)
+    world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
+    pose, ground_pose = T_map_sensor[:3].astype(np.float32), _product(T_ground_map, T_map_sensor)
+    bundle = packed, order, cones, pose, ground_pose, np.float32(time)
+    out = _addresses(distances, normals, faces, instances)
     discs = _discs(World(*world), pose)
     for chunk in nb.prange(_chunks(order, lanes)):
         _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, out)
@@ -284,8 +308,10 @@ def _rays_chunk(chunk, lanes, world, ray_fields, near, far, coherent, out):
         packets.address(packet),
         packets.address(arguments) + (0 if coherent else 64),
     )
-    others, ground, ground_id, _, rows, motion, keys = world
+    others, ground, ground_id, T_ground_map, _, rows, motion, keys = world
     p_rows, p_motion, p_order = packets.address(rows), packets.address(motion), packets.address(rays.order)
+    pose = T_ground_map[:3].astype(np.float32)
+    p_pose = packets.address(pose)
     p_distances, p_normals, p_faces, p_instances = out
     for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, rays.order.shape[0] // width)):
         base = block * width
@@ -294,20 +320,21 @@ def _rays_chunk(chunk, lanes, world, ray_fields, near, far, coherent, out):
         if others:
             packets.intersect(lanes, p_valid, others, p_packet, p_arguments)
         if ground:
+            packets.carry(lanes, p_packet, p_pose)
             packets.intersect(lanes, p_valid, ground, p_packet, p_arguments)
         if not packets.turn_alike(lanes, p_packet, ground_id, p_rows, p_motion):
             packets.turn_mixed(lanes, packet, integers, ground_id, rows, motion, keys)
         packets.write(lanes, p_packet, p_order + 4 * base, p_distances, p_normals, p_faces, p_instances)
-    return valid[0] + np.int32(arguments[0, 0])
+    return valid[0] + np.int32(arguments[0, 0]) + np.int32(pose[0, 0])
 
 
 @nb.njit(cache=True, nogil=True)
 def cast_rays(
-    lanes, others, ground, ground_id, listed, rows, motion, keys,
+    lanes, others, ground, ground_id, T_ground_map, listed, rows, motion, keys,
     origins, directions, times, order, near, far, coherent, distances, normals, faces, instances,
 ):  # fmt: skip
     """Nearest hits of single rays, on the calling thread."""
-    world = others, ground, ground_id, listed, rows, motion, keys
+    world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
     rays, out = (origins, directions, times, order), _addresses(distances, normals, faces, instances)
     for chunk in range(_chunks(order, lanes)):
         _rays_chunk(chunk, lanes, world, rays, np.float32(near), np.float32(far), coherent, out)
@@ -315,22 +342,24 @@ def cast_rays(
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def cast_rays_parallel(
-    lanes, others, ground, ground_id, listed, rows, motion, keys,
+    lanes, others, ground, ground_id, T_ground_map, listed, rows, motion, keys,
     origins, directions, times, order, near, far, coherent, distances, normals, faces, instances,
 ):  # fmt: skip
     """`cast_rays` on numba's threads."""
-    world = others, ground, ground_id, listed, rows, motion, keys
+    world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
     rays, out = (origins, directions, times, order), _addresses(distances, normals, faces, instances)
     for chunk in nb.prange(_chunks(order, lanes)):
         _rays_chunk(chunk, lanes, world, rays, np.float32(near), np.float32(far), coherent, out)
 
 
 @nb.njit(cache=True, nogil=True)
-def _occluded_chunk(chunk, lanes, others, ground, ray_fields, near, limits, blocked):
+def _occluded_chunk(chunk, lanes, others, ground, T_ground_map, ray_fields, near, limits, blocked):
     rays = Rays(*ray_fields)
     packet, integers, valid = packets.new_packet(lanes, near, np.float32(0.0))
     arguments = packets.arguments()
     p_valid, p_packet, p_arguments = packets.address(valid), packets.address(packet), packets.address(arguments) + 64
+    pose = T_ground_map[:3].astype(np.float32)
+    p_pose = packets.address(pose)
     for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, rays.order.shape[0] // len(lanes))):
         base = block * len(lanes)
         _load(lanes, packet, integers, valid, rays, base)
@@ -342,23 +371,24 @@ def _occluded_chunk(chunk, lanes, others, ground, ray_fields, near, limits, bloc
         if others:
             packets.occlude(lanes, p_valid, others, p_packet, p_arguments)
         if ground:
+            packets.carry(lanes, p_packet, p_pose)
             packets.occlude(lanes, p_valid, ground, p_packet, p_arguments)
         for k in range(len(lanes)):
             blocked[rays.order[base + k]] = valid[k] != 0 and packet[8 * len(lanes) + k] < 0.0
-    return valid[0] + np.int32(arguments[0, 0])
+    return valid[0] + np.int32(arguments[0, 0]) + np.int32(pose[0, 0])
 
 
 @nb.njit(cache=True, nogil=True)
-def occluded(lanes, others, ground, origins, directions, times, order, near, limits, blocked):
+def occluded(lanes, others, ground, T_ground_map, origins, directions, times, order, near, limits, blocked):
     """Whether anything is nearer than `limits`, on the calling thread."""
     rays = origins, directions, times, order
     for chunk in range(_chunks(order, lanes)):
-        _occluded_chunk(chunk, lanes, others, ground, rays, np.float32(near), limits, blocked)
+        _occluded_chunk(chunk, lanes, others, ground, T_ground_map, rays, np.float32(near), limits, blocked)
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
-def occluded_parallel(lanes, others, ground, origins, directions, times, order, near, limits, blocked):
+def occluded_parallel(lanes, others, ground, T_ground_map, origins, directions, times, order, near, limits, blocked):
     """`occluded` on numba's threads."""
     rays = origins, directions, times, order
     for chunk in nb.prange(_chunks(order, lanes)):
-        _occluded_chunk(chunk, lanes, others, ground, rays, np.float32(near), limits, blocked)
+        _occluded_chunk(chunk, lanes, others, ground, T_ground_map, rays, np.float32(near), limits, blocked)

@@ -11,7 +11,17 @@ import numba as nb
 import numpy as np
 from numba import types
 
-from simtrack.raycast.vector import carray, fill_float, fill_int, pointer, prefetch, scatter, unit_normals
+from simtrack.raycast.vector import (
+    carray,
+    fill_float,
+    fill_int,
+    move,
+    pointer,
+    prefetch,
+    rotate,
+    scatter,
+    unit_normals,
+)
 
 ROW = 14
 """Numbers in a row of `simtrack.raycast.table.InstanceTable.rows`."""
@@ -89,6 +99,23 @@ def reset(lanes, packet, far):
     fill_int(lanes, packet + 17 * row, np.int32(-1))
     fill_int(lanes, packet + 18 * row, np.int32(-1))
     fill_int(lanes, packet + 19 * row, np.int32(-1))
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def stand(lanes, packet, pose):
+    """All rays of a packet from the origin of a (3, 4) pose; addresses of both."""
+    width = len(lanes)
+    entries = carray(pointer(pose), 12, np.float32)
+    for axis in range(3):
+        fill_float(lanes, packet + 4 * axis * width, entries[4 * axis + 3])
+
+
+@nb.njit(cache=True, nogil=True, inline="always")
+def carry(lanes, packet, pose):
+    """Take a packet's rays to another frame; addresses of the packet and of a rigid (3, 4) pose."""
+    width = len(lanes)
+    move(lanes, pose, packet, packet)
+    rotate(lanes, pose, packet + 16 * width, packet + 16 * width)
 
 
 @nb.njit(cache=True, nogil=True)

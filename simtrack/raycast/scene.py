@@ -39,7 +39,7 @@ class RayScene:
     releases the interpreter lock; changing the scene while another thread casts is not allowed (changes are serialised
     among themselves). The threads used are ``numba.get_num_threads()``; results do not depend on their number.
 
-    The largest instance that stands at the identity, such as a static map, is the ground: rays are traced in its mesh
+    An instance that is much larger than all others, such as a static map, is the ground: rays are traced in its mesh
     directly, and through the hierarchy of instances only where one of the others may be met.
     """
 
@@ -310,7 +310,8 @@ class RayScene:
         blocked = np.zeros(len(limit), np.bool_)
         if len(limit):
             lanes = (0,) * rtc.embree().packet_width
-            arguments = (lanes, *self._hierarchy.world[:2], *rays, float(min_distance), limit, blocked)
+            others, ground, _, T_ground_map = self._hierarchy.world[:4]
+            arguments = (lanes, others, ground, T_ground_map, *rays, float(min_distance), limit, blocked)
             kernels.run(len(limit), kernels.occluded, kernels.occluded_parallel, *arguments)
         return blocked
 
@@ -344,7 +345,7 @@ class RayScene:
             output = (found.points, found.distances, found.instances, found.faces)
             arguments = (closest.CALLBACK, queries, float(max_distance), self._table.buffers, self._table.poses)
             kernels.run(
-                16 * count, closest.closest, closest.closest_parallel, *self._hierarchy.world[:3], *arguments, *output
+                16 * count, closest.closest, closest.closest_parallel, *self._hierarchy.world[:4], *arguments, *output
             )
         if signed:
             self._give_signs(queries, found)

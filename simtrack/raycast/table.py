@@ -38,12 +38,10 @@ class InstanceTable:
         """(K, 3, 3), linear parts of the motion keys."""
         self.enabled: Bool = np.zeros(0, np.bool_)
         """(M,), of instances that exist."""
-        self.unmoved: Bool = np.zeros(0, np.bool_)
-        """(M,), whether the pose is the identity, exactly, and at rest."""
+        self.rigid: Bool = np.zeros(0, np.bool_)
+        """(M,), whether the instance is at rest at a pose that keeps lengths and does not mirror."""
         self.members_changed = True
-        """Whether instances were added, removed, shown or hidden; reset by who has looked."""
-        self.ground_stale = False
-        """Whether such an instance, or one that came to or left its place, stands at the identity; likewise."""
+        """Whether instances were added, removed, shown or hidden, or `rigid` changed; reset by who has looked."""
 
     def reserve(self, number: int) -> None:
         """Make room for an instance id."""
@@ -51,7 +49,7 @@ class InstanceTable:
         if number < have:
             return
         size = max(number + 1, 2 * have, 16)
-        for name in ("poses", "spheres", "handles", "buffers", "rows", "motion", "enabled", "unmoved"):
+        for name in ("poses", "spheres", "handles", "buffers", "rows", "motion", "enabled", "rigid"):
             old = getattr(self, name)
             new = np.zeros((size, *old.shape[1:]), old.dtype)
             new[:have] = old
@@ -63,31 +61,29 @@ class InstanceTable:
         self.spheres[numbers] = [(*mesh.bounding_sphere[0], mesh.bounding_sphere[1]) for mesh in meshes]
         self.buffers[numbers] = [(mesh.vertices.ctypes.data, mesh.faces.ctypes.data) for mesh in meshes]
         self.rows[numbers, 13] = [len(mesh.faces) for mesh in meshes]
-        self.handles[numbers], self.enabled[numbers], self.unmoved[numbers] = 0, True, False
+        self.handles[numbers], self.enabled[numbers], self.rigid[numbers] = 0, True, False
         self.members_changed = True
         self.place(numbers, poses)
 
     def remove(self, numbers: npt.NDArray[np.int64]) -> None:
         """Strike instances out."""
         self.members_changed = True
-        self.ground_stale |= bool(self.unmoved[numbers].any())
-        self.enabled[numbers] = self.unmoved[numbers] = False
+        self.enabled[numbers] = self.rigid[numbers] = False
 
     def enable(self, number: int, enabled: bool) -> None:
         """Show or hide an instance."""
         self.members_changed = True
-        self.ground_stale |= bool(self.unmoved[number])
         self.enabled[number] = enabled
 
     def place(self, numbers: npt.NDArray[np.int64], poses: Float64) -> None:
         """Put instances to rest at (N, 4, 4) valid poses."""
-        arrays = self.poses, self.spheres, self.rows, self.motion, self.unmoved
-        self.ground_stale |= bool(_place(numbers, poses, *arrays))
+        arrays = self.poses, self.spheres, self.rows, self.motion, self.rigid
+        self.members_changed |= bool(_place(numbers, poses, *arrays))
 
     def set_off(self, number: int) -> None:
         """Note that an instance moves; its keys come with `set_motions`."""
-        self.ground_stale |= bool(self.unmoved[number])
-        self.unmoved[number] = False
+        self.members_changed = True
+        self.rigid[number] = False
 
     def set_motions(self, motions: Mapping[int, Float64]) -> None:
         """Fill `keys` and `motion` for the instances that move, by id (K, 4, 4), and bound all of their way."""
@@ -180,17 +176,26 @@ def _describe(T, sphere, row):
 
 
 @nb.njit(cache=True, nogil=True)
-def _place(numbers, poses, all_poses, spheres, rows, motion, unmoved):
+def _is_rigid(T):
+    for i in range(3):
+        for j in range(3):
+            product = T[0, i] * T[0, j] + T[1, i] * T[1, j] + T[2, i] * T[2, j]
+            if abs(product - (1.0 if i == j else 0.0)) > 1e-7:
+                return False
+    return _determinant(T) > 0.0
+
+
+@nb.njit(cache=True, nogil=True)
+def _place(numbers, poses, all_poses, spheres, rows, motion, rigid):
     changed = False
     for k in range(numbers.shape[0]):
         number, T = numbers[k], poses[k]
-        identity = True
         for i in range(4):
             for j in range(4):
                 all_poses[number, i, j] = T[i, j]
-                identity &= T[i, j] == (1.0 if i == j else 0.0)
-        changed |= unmoved[number] != identity
-        unmoved[number] = identity
+        now = _is_rigid(T)
+        changed |= rigid[number] != now
+        rigid[number] = now
         motion[number, 0], motion[number, 1] = 0, 1
         _describe(T, spheres[number], rows[number])
     return changed

@@ -47,11 +47,12 @@ def _fill(element: ir.Type, kind: Any) -> Any:
     return fill
 
 
-def _product(columns: int, unit: bool) -> Any:
+def _product(columns: int, *, offset: bool = False, unit: bool = False) -> Any:
     """Intrinsic ``product(lanes, matrix, source, target)``: three rows of the packet times a row-major matrix.
 
     Args:
-        columns: numbers in a row of the matrix; what follows the third is not used.
+        columns: numbers in a row of the matrix.
+        offset: whether the fourth column is added.
         unit: whether the products are scaled to length one.
     """
 
@@ -71,6 +72,9 @@ def _product(columns: int, unit: bool) -> Any:
                     at = builder.gep(entry, [ir.Constant(_INT, axis * columns + column)])
                     term = builder.fmul(_splat(builder, builder.load(at, align=4), width), rows[column])
                     total = term if total is None else builder.fadd(total, term)
+                if offset:
+                    at = builder.gep(entry, [ir.Constant(_INT, axis * columns + 3)])
+                    total = builder.fadd(total, _splat(builder, builder.load(at, align=4), width))
                 out.append(total)
             if unit:
                 square = builder.fadd(
@@ -181,7 +185,9 @@ fill_float: Any = intrinsic(_fill(_FLOAT, types.float32))
 """``fill_float(lanes, target, value)`` sets a row of W floats to one value."""
 fill_int: Any = intrinsic(_fill(_INT, types.int32))
 """``fill_int(lanes, target, value)`` sets a row of W integers to one value."""
-rotate: Any = intrinsic(_product(4, False))
+move: Any = intrinsic(_product(4, offset=True))
+"""``move(lanes, matrix, source, target)``: rows x, y, z of W points times a (3, 4) matrix."""
+rotate: Any = intrinsic(_product(4))
 """``rotate(lanes, matrix, source, target)``: rows x, y, z of W vectors times the left part of a (3, 4) matrix."""
-unit_normals: Any = intrinsic(_product(3, True))
+unit_normals: Any = intrinsic(_product(3, unit=True))
 """``unit_normals(lanes, matrix, source, target)``: rows x, y, z of W normals times a (3, 3) matrix, as unit vectors."""
