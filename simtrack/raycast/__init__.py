@@ -7,8 +7,8 @@ import os
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from simtrack.raycast.bundle import RayBundle
-from simtrack.raycast.hits import ClosestPoints, RayHits
+from simtrack.raycast.hits import ClosestPoints, RayHits, SelectedHits
 from simtrack.raycast.mesh import TriangleMesh
 from simtrack.raycast.scene import RayScene
 
-__all__ = ["ClosestPoints", "RayBundle", "RayHits", "RayScene", "TriangleMesh"]
+__all__ = ["ClosestPoints", "RayBundle", "RayHits", "RayScene", "SelectedHits", "TriangleMesh"]

@@ -72,3 +72,16 @@ class ClosestPoints:
             np.empty(count, np.int32),
             np.empty(count, np.int32),
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SelectedHits:
+    """The rays of a bundle that met certain instances, in an order that is the same for the same bundle."""
+
+    rays: Int32
+    """(M,), ray of each hit, once at most."""
+    hits: RayHits
+    """Of M rays."""
+
+    def __len__(self) -> int:
+        return len(self.rays)

@@ -32,7 +32,8 @@ SMALL = 4096
 """So few rays are faster cast by the calling thread alone."""
 _POOL_LOCK = Lock()
 
-_OTHERS, _GROUND, _OTHERS_COHERENT, _GROUND_COHERENT = 1, 2, 4, 8
+OTHERS, GROUND, OTHERS_COHERENT, GROUND_COHERENT = 1, 2, 4, 8
+"""Flags of `to_trace`."""
 
 
 class World(NamedTuple):
@@ -85,20 +86,19 @@ class Rays(NamedTuple):
     """(B * W,) int32."""
 
 
-def run(count: int, serial: Any, parallel: Any, *arguments: Any) -> None:
+def run(count: int, serial: Any, parallel: Any, *arguments: Any) -> Any:
     """Call a kernel for `count` rays with `numba.get_num_threads()` threads, which one caller at a time may use."""
     if count <= SMALL or nb.get_num_threads() == 1:
-        serial(*arguments)
-        return
+        return serial(*arguments)
     with _POOL_LOCK:
-        parallel(*arguments)
+        return parallel(*arguments)
 
 
 # ----------------------------------------------------------------------------------------------- rays from one origin
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _discs(world, pose):
+def discs_of(world, pose):
     """(L + 1, 6) float32, sensor frame: spheres of the listed instances, then of the ground, as the sensor sees them.
 
     Direction, cosine and sine of the angular radius, and faces by 1 - cosine; cosine -1 and no faces where the sphere
@@ -143,7 +143,7 @@ def _meets(cone, disc):
 
 
 @nb.njit(cache=True, nogil=True)
-def _to_trace(world, cones, group, discs, rays, met):
+def to_trace(world, cones, group, discs, rays, met):
     """Which hierarchies the packets of a group may have to be traced in, and how: flags; and how many discs are `met`.
 
     `rays` is their number. With others to trace and none met, there is no telling which they are.
@@ -151,28 +151,28 @@ def _to_trace(world, cones, group, discs, rays, met):
     flags, count = 0, 0
     last = discs.shape[0] - 1
     if cones.shape[0] == 0:
-        flags = _OTHERS_COHERENT | _GROUND_COHERENT
-        return flags | (_OTHERS if world.others else 0) | (_GROUND if world.ground else 0), 0
+        flags = OTHERS_COHERENT | GROUND_COHERENT
+        return flags | (OTHERS if world.others else 0) | (GROUND if world.ground else 0), 0
     cone = cones[group]
     limit = np.float32(_FACES_PER_RAY) * np.float32(rays)
     if world.others and last == 0:
-        flags = _OTHERS | _OTHERS_COHERENT
+        flags = OTHERS | OTHERS_COHERENT
     for j in range(last):
         if _meets(cone, discs[j]):
             met[count] = j
             count += 1
-            flags |= _OTHERS
+            flags |= OTHERS
             if discs[j, 5] * cone[5] <= limit:
-                flags |= _OTHERS_COHERENT
+                flags |= OTHERS_COHERENT
     if world.ground and _meets(cone, discs[last]):
-        flags |= _GROUND
+        flags |= GROUND
         if discs[last, 5] * cone[5] <= limit:
-            flags |= _GROUND_COHERENT
+            flags |= GROUND_COHERENT
     return flags, count
 
 
 @nb.njit(cache=True, nogil=True)
-def _any_meets(lanes, directions, discs, met, count):
+def any_meets(lanes, directions, discs, met, count):
     """Whether a ray of a packet (addresses of the directions and discs) may meet one of the first `count` of `met`."""
     for k in range(count):
         disc = discs + 24 * met[k]
@@ -195,30 +195,30 @@ def _bundle_chunk(chunk, lanes, world_fields, bundle_fields, discs, near, far, t
     p_packed, p_order = packets.address(bundle.packed), packets.address(bundle.order)
     p_rows, p_motion = packets.address(rows), packets.address(motion)
     p_distances, p_normals, p_faces, p_instances = out
-    p_discs, met = packets.address(discs), np.empty(discs.shape[0], np.int64)
+    pdiscs_of, met = packets.address(discs), np.empty(discs.shape[0], np.int64)
     blocks, cones = bundle.packed.shape[0], bundle.cones
     packets.stand(lanes, p_packet, p_pose)
     for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, blocks), GROUP):
-        flags, count = _to_trace(world, cones, first // GROUP, discs, GROUP * width, met)
+        flags, count = to_trace(world, cones, first // GROUP, discs, GROUP * width, met)
         if together >= 0:
-            flags = flags & (_OTHERS | _GROUND) | (together * (_OTHERS_COHERENT | _GROUND_COHERENT))
+            flags = flags & (OTHERS | GROUND) | (together * (OTHERS_COHERENT | GROUND_COHERENT))
         for block in range(first, min(first + GROUP, blocks)):
             rays = p_order + 4 * block * width
             packets.announce(lanes, block, rays, p_distances, p_normals, p_faces, p_instances)
             packets.reset(lanes, p_packet, far)
             directions = p_packed + 12 * block * width
-            aimed = flags & _OTHERS and _any_meets(lanes, directions, p_discs, met, count)
+            aimed = flags & OTHERS and any_meets(lanes, directions, pdiscs_of, met, count)
             if aimed:
                 if apart:
                     packets.stand(lanes, p_packet, p_pose)
                 rotate(lanes, p_pose, directions, p_packet + 16 * width)
-                packets.intersect(lanes, p_valid, others, p_packet, p_together if flags & _OTHERS_COHERENT else p_alone)
-            if flags & _GROUND:
+                packets.intersect(lanes, p_valid, others, p_packet, p_together if flags & OTHERS_COHERENT else p_alone)
+            if flags & GROUND:
                 if apart:
                     packets.stand(lanes, p_packet, p_ground_pose)
                 if apart or not aimed:
                     rotate(lanes, p_ground_pose, directions, p_packet + 16 * width)
-                packets.intersect(lanes, p_valid, ground, p_packet, p_together if flags & _GROUND_COHERENT else p_alone)
+                packets.intersect(lanes, p_valid, ground, p_packet, p_together if flags & GROUND_COHERENT else p_alone)
             if not packets.turn_alike(lanes, p_packet, ground_id, p_rows, p_motion):
                 packets.turn_mixed(lanes, packet, integers, ground_id, rows, motion, keys)
             packets.write(lanes, p_packet, rays, p_distances, p_normals, p_faces, p_instances)
@@ -226,7 +226,7 @@ def _bundle_chunk(chunk, lanes, world_fields, bundle_fields, discs, near, far, t
 
 
 @nb.njit(cache=True, nogil=True)
-def _product(A, B):
+def product(A, B):
     """(3, 4) float32, the upper rows of the product of two affine (4, 4)."""
     out = np.empty((3, 4), np.float32)
     for i in range(3):
@@ -243,7 +243,8 @@ def _addresses(distances, normals, faces, instances):
 
 
 @nb.njit(cache=True, nogil=True)
-def _chunks(order, lanes):
+def chunk_count(order, lanes):
+    """Number of chunks of packets."""
     return (order.shape[0] // len(lanes) + CHUNK - 1) // CHUNK
 
 
@@ -254,11 +255,11 @@ def cast_bundle(
 ):  # fmt: skip
     """Nearest hits of a bundle, on the calling thread; `together` is 1 or 0 for `coherent`, -1 to decide by group."""
     world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
-    pose, ground_pose = T_map_sensor[:3].astype(np.float32), _product(T_ground_map, T_map_sensor)
+    pose, ground_pose = T_map_sensor[:3].astype(np.float32), product(T_ground_map, T_map_sensor)
     bundle = packed, order, cones, pose, ground_pose, np.float32(time)
     out = _addresses(distances, normals, faces, instances)
-    discs = _discs(World(*world), pose)
-    for chunk in range(_chunks(order, lanes)):
+    discs = discs_of(World(*world), pose)
+    for chunk in range(chunk_count(order, lanes)):
         _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, out)
 
 
@@ -269,11 +270,11 @@ def cast_bundle_parallel(
 ):  # fmt: skip
     """`cast_bundle` on numba's threads."""
     world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
-    pose, ground_pose = T_map_sensor[:3].astype(np.float32), _product(T_ground_map, T_map_sensor)
+    pose, ground_pose = T_map_sensor[:3].astype(np.float32), product(T_ground_map, T_map_sensor)
     bundle = packed, order, cones, pose, ground_pose, np.float32(time)
     out = _addresses(distances, normals, faces, instances)
-    discs = _discs(World(*world), pose)
-    for chunk in nb.prange(_chunks(order, lanes)):
+    discs = discs_of(World(*world), pose)
+    for chunk in nb.prange(chunk_count(order, lanes)):
         _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, out)
 
 
@@ -336,7 +337,7 @@ def cast_rays(
     """Nearest hits of single rays, on the calling thread."""
     world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
     rays, out = (origins, directions, times, order), _addresses(distances, normals, faces, instances)
-    for chunk in range(_chunks(order, lanes)):
+    for chunk in range(chunk_count(order, lanes)):
         _rays_chunk(chunk, lanes, world, rays, np.float32(near), np.float32(far), coherent, out)
 
 
@@ -348,7 +349,7 @@ def cast_rays_parallel(
     """`cast_rays` on numba's threads."""
     world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
     rays, out = (origins, directions, times, order), _addresses(distances, normals, faces, instances)
-    for chunk in nb.prange(_chunks(order, lanes)):
+    for chunk in nb.prange(chunk_count(order, lanes)):
         _rays_chunk(chunk, lanes, world, rays, np.float32(near), np.float32(far), coherent, out)
 
 
@@ -382,7 +383,7 @@ def _occluded_chunk(chunk, lanes, others, ground, T_ground_map, ray_fields, near
 def occluded(lanes, others, ground, T_ground_map, origins, directions, times, order, near, limits, blocked):
     """Whether anything is nearer than `limits`, on the calling thread."""
     rays = origins, directions, times, order
-    for chunk in range(_chunks(order, lanes)):
+    for chunk in range(chunk_count(order, lanes)):
         _occluded_chunk(chunk, lanes, others, ground, T_ground_map, rays, np.float32(near), limits, blocked)
 
 
@@ -390,5 +391,5 @@ def occluded(lanes, others, ground, T_ground_map, origins, directions, times, or
 def occluded_parallel(lanes, others, ground, T_ground_map, origins, directions, times, order, near, limits, blocked):
     """`occluded` on numba's threads."""
     rays = origins, directions, times, order
-    for chunk in nb.prange(_chunks(order, lanes)):
+    for chunk in nb.prange(chunk_count(order, lanes)):
         _occluded_chunk(chunk, lanes, others, ground, T_ground_map, rays, np.float32(near), limits, blocked)

@@ -14,7 +14,7 @@ from simtrack.raycast import embree as rtc
 from simtrack.raycast import fallback, kernels
 from simtrack.raycast.bundle import RayBundle
 from simtrack.raycast.hierarchy import Hierarchy
-from simtrack.raycast.hits import ClosestPoints, RayHits
+from simtrack.raycast.hits import ClosestPoints, RayHits, SelectedHits
 from simtrack.raycast.mesh import TriangleMesh
 from simtrack.raycast.table import InstanceTable, checked_pose, checked_poses
 
@@ -253,6 +253,53 @@ class RayScene:
             arguments = (lanes, *self._hierarchy.world, *rays, -1 if coherent is None else int(coherent), *output)
             kernels.run(len(bundle), kernels.cast_bundle, kernels.cast_bundle_parallel, *arguments)
         return hits
+
+    def cast_at(
+        self,
+        bundle: RayBundle,
+        T_map_sensor: npt.ArrayLike,
+        instances: Sequence[int],
+        max_distance: float = np.inf,
+        *,
+        min_distance: float = 0.0,
+        time: float = 0.0,
+        coherent: bool | None = None,
+    ) -> SelectedHits:
+        """Cast a bundle and keep the nearest hits that are on certain instances.
+
+        The same as `cast` and a choice among its hits, but only rays that the instances' bounding spheres let meet one
+        are traced. Everything else in the scene occludes.
+
+        Args:
+            bundle: see `cast`, as for the other arguments.
+            T_map_sensor: see there.
+            instances: ids; those that are hidden are met by nothing.
+            max_distance: see there.
+            min_distance: see there.
+            time: see there.
+            coherent: see there.
+        """
+        if self._hierarchy is None:
+            hits = self.cast(bundle, T_map_sensor, max_distance, min_distance=min_distance, time=time)
+            rays = np.flatnonzero(np.isin(hits.instances, list(map(self._known, instances)))).astype(np.int32)
+            kept = RayHits(hits.distances[rays], hits.normals[rays], hits.faces[rays], hits.instances[rays])
+            return SelectedHits(rays, kept)
+        from simtrack.raycast.selective import cast_selected, cast_selected_parallel
+
+        T = checked_pose(T_map_sensor, "T_map_sensor")
+        self.commit()
+        wanted = np.zeros(len(self._table.enabled) + 1, np.bool_)
+        wanted[[self._known(instance) for instance in instances]] = True
+        wanted[:-1] &= self._table.enabled
+        room, rays = RayHits.empty(len(bundle.order)), np.empty(len(bundle.order), np.int32)
+        count = 0
+        if wanted.any():
+            lanes, output = (0,) * bundle.packed.shape[2], (room.distances, room.normals, room.faces, room.instances)
+            aim = bundle.packed, bundle.order, bundle.cones, T, float(time), float(min_distance), float(max_distance)
+            arguments = (lanes, *self._hierarchy.world, wanted, *aim, -1 if coherent is None else int(coherent))
+            count = kernels.run(len(bundle), cast_selected, cast_selected_parallel, *arguments, rays, *output)
+        hits = RayHits(room.distances[:count], room.normals[:count], room.faces[:count], room.instances[:count])
+        return SelectedHits(rays[:count], hits)
 
     def cast_rays(
         self,
