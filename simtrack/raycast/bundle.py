@@ -122,6 +122,33 @@ class RayBundle:
         return RayBundle(rays, order, packed, cones=_cones(packed))
 
 
+def checked_rays(
+    origins: npt.ArrayLike, directions: npt.ArrayLike, times: npt.ArrayLike | None, packing: RayBundle | None
+) -> tuple[Float32, Float32, Float32, Int32]:
+    """Rays of their own origin and time as kernels take them; arguments as of `simtrack.raycast.RayScene.cast_rays`.
+
+    Returns:
+        Origins and directions (N, 3), times (N,) or none, and the order (P,) in which packets take the rays.
+
+    Raises:
+        InvalidValueError: wrong shapes, or a packing of another number of rays.
+    """
+    starts, rays = np.require(origins, np.float32, ["C", "W"]), np.require(directions, np.float32, ["C", "W"])
+    if rays.ndim != 2 or rays.shape[1] != 3 or starts.shape != rays.shape:
+        raise InvalidValueError("origins, directions", (starts.shape, rays.shape), "two arrays (N, 3)")
+    count = len(rays)
+    moments = np.empty(0, np.float32) if times is None else np.require(times, np.float32, ["C", "W"])
+    if times is not None and moments.shape != (count,):
+        raise InvalidValueError("times", moments.shape, f"({count},)")
+    if packing is not None:
+        if len(packing) != count:
+            raise InvalidValueError("packing", len(packing), f"a bundle of {count} rays")
+        return starts, rays, moments, packing.order
+    width = rtc.embree().packet_width if rtc.available() else 1
+    order = np.minimum(np.arange(-(-count // width) * width, dtype=np.int32), np.int32(max(count - 1, 0)))
+    return starts, rays, moments, order
+
+
 def _group_starts(labels: np.ndarray) -> np.ndarray:
     _, counts = np.unique(labels, return_counts=True)
     return np.cumsum(counts)[:-1]

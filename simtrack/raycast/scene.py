@@ -8,11 +8,11 @@ from types import TracebackType
 import numpy as np
 import numpy.typing as npt
 
-from simtrack.contracts import Bool, Float32, Float64, Int32
+from simtrack.contracts import Bool, Float32, Float64
 from simtrack.errors import InvalidValueError, RaycastError
 from simtrack.raycast import embree as rtc
 from simtrack.raycast import fallback, kernels
-from simtrack.raycast.bundle import RayBundle
+from simtrack.raycast.bundle import RayBundle, checked_rays
 from simtrack.raycast.hierarchy import Hierarchy
 from simtrack.raycast.hits import ClosestPoints, RayHits, SelectedHits
 from simtrack.raycast.mesh import TriangleMesh
@@ -324,7 +324,7 @@ class RayScene:
                 caller's order where that puts neighbours far apart.
             out: results to overwrite and return.
         """
-        rays = _checked_rays(origins, directions, times, packing)
+        rays = checked_rays(origins, directions, times, packing)
         self.commit()
         hits = RayHits.reuse(out, len(rays[0]))
         if self._hierarchy is None:
@@ -347,7 +347,7 @@ class RayScene:
         min_distance: float = 0.0,
     ) -> Bool:
         """(N,), whether anything lies on the ray between `min_distance` and its (N,) distance (see `cast_rays`)."""
-        rays = _checked_rays(origins, directions, times, None)
+        rays = checked_rays(origins, directions, times, None)
         limit = np.ascontiguousarray(np.broadcast_to(np.asarray(distances, np.float32), (len(rays[0]),)))
         self.commit()
         if self._hierarchy is None:
@@ -444,22 +444,3 @@ class RayScene:
             number: Instance(mesh, self._motions.get(number, poses[number : number + 1]), bool(enabled[number]))
             for number, mesh in self._meshes.items()
         }
-
-
-def _checked_rays(
-    origins: npt.ArrayLike, directions: npt.ArrayLike, times: npt.ArrayLike | None, packing: RayBundle | None
-) -> tuple[Float32, Float32, Float32, Int32]:
-    starts, rays = np.require(origins, np.float32, ["C", "W"]), np.require(directions, np.float32, ["C", "W"])
-    if rays.ndim != 2 or rays.shape[1] != 3 or starts.shape != rays.shape:
-        raise InvalidValueError("origins, directions", (starts.shape, rays.shape), "two arrays (N, 3)")
-    count = len(rays)
-    moments = np.empty(0, np.float32) if times is None else np.require(times, np.float32, ["C", "W"])
-    if times is not None and moments.shape != (count,):
-        raise InvalidValueError("times", moments.shape, f"({count},)")
-    if packing is not None:
-        if len(packing) != count:
-            raise InvalidValueError("packing", len(packing), f"a bundle of {count} rays")
-        return starts, rays, moments, packing.order
-    width = rtc.embree().packet_width if rtc.available() else 1
-    order = np.minimum(np.arange(-(-count // width) * width, dtype=np.int32), np.int32(max(count - 1, 0)))
-    return starts, rays, moments, order
