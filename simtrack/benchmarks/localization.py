@@ -265,7 +265,7 @@ def _peers(
 
 def _small_gicp(static_map: StaticMap, points: Float64, threads: int) -> dict[str, Callable[[Float64], Float64]]:
     """Registration to the middles of the map's faces; the map is prepared once, the scan each time."""
-    import small_gicp
+    import small_gicp  # pyright: ignore[reportMissingImports] - extra `bench`
 
     resolution = 0.1
     centres = static_map.vertices.astype(np.float64)[static_map.faces].mean(axis=1)
@@ -283,7 +283,7 @@ def _small_gicp(static_map: StaticMap, points: Float64, threads: int) -> dict[st
 
 def _open3d(static_map: StaticMap, points: Float64, threads: int) -> dict[str, Callable[[Float64], Float64]]:
     """Point-to-plane ICP to the middles of the map's faces with the faces' normals."""
-    import open3d
+    import open3d  # pyright: ignore[reportMissingImports] - extra `bench`
 
     geometry, registration = open3d.geometry, open3d.pipelines.registration
     corners = static_map.vertices.astype(np.float64)[static_map.faces]

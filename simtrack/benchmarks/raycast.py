@@ -119,7 +119,7 @@ def _trimesh(world: Office) -> Engine:
 
 
 def _open3d_scene(world: Office, threads: int) -> Any:
-    import open3d
+    import open3d  # pyright: ignore[reportMissingImports] - extra `bench`
 
     scene = open3d.t.geometry.RaycastingScene(nthreads=threads)
     for mesh in world.posed():
@@ -128,7 +128,7 @@ def _open3d_scene(world: Office, threads: int) -> Any:
 
 
 def _tensor(array: npt.NDArray[Any]) -> Any:
-    import open3d
+    import open3d  # pyright: ignore[reportMissingImports] - extra `bench`
 
     make: Any = open3d.core.Tensor
     return make(array)
