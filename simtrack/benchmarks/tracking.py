@@ -5,7 +5,7 @@ traced at the office, and five objects are registered to what they met. The adap
 windows hold, and stops when nothing moves any more.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -49,9 +49,9 @@ class _Sensor:
         self.directions = np.ascontiguousarray(self.rays.directions @ rotation.T)
         self.origin = self.T_camera_sensor[:3, 3].copy()
 
-    def cast(self, scene: RayScene) -> None:
-        """Trace all rays."""
-        scene.cast(self.rays, self.T_camera_sensor, out=self.hits)
+    def cast(self, scene: RayScene, changed: Sequence[int] | None = None) -> None:
+        """Trace all rays, or those on which changed instances make a difference to the last hits."""
+        scene.cast(self.rays, self.T_camera_sensor, out=self.hits, changed=changed)
 
 
 class PaperFrame:
@@ -99,11 +99,15 @@ class PaperFrame:
         """(K,) distances of the poses' origins from the true ones, metres."""
         return np.linalg.norm(poses[:, :3, 3] - self.truth[:, :3, 3], axis=1)
 
-    def cast(self, poses: Float64) -> None:
-        """Trace both sensors' rays with the objects at `poses`."""
+    def cast(self, poses: Float64, *, again: bool = False) -> None:
+        """Bring both sensors' hits up to date with the objects at `poses`.
+
+        `again` says that nothing but the objects has moved since the last cast: rays that neither met an object then
+        nor may meet one now have kept their hits, and are not traced.
+        """
         self.scene.set_poses(range(len(poses)), poses)
         for sensor in (self.camera, self.lidar):
-            sensor.cast(self.scene)
+            sensor.cast(self.scene, range(len(poses)) if again else None)
 
     def correspond(self, gate: float) -> int:
         """Pair all rays of both sensors; returns the number of pairs."""
@@ -144,7 +148,7 @@ class PaperFrame:
         """The whole frame from `poses`; `watch` sees the poses after each iteration."""
         poses = poses.copy()
         for iteration in range(ITERATIONS):
-            self.cast(poses)
+            self.cast(poses, again=iteration > 0)
             self.solve(poses, self.correspond(GATES[iteration]), method)
             watch(poses)
         return poses

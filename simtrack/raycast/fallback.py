@@ -1,6 +1,7 @@
 """Casting without instances: `embreex`'s single rays against each mesh in its own frame."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,11 +10,21 @@ from simtrack.contracts import Float32, Float64
 
 if TYPE_CHECKING:
     from simtrack.raycast.hits import ClosestPoints, RayHits
-    from simtrack.raycast.scene import Instance
+    from simtrack.raycast.mesh import TriangleMesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instance:
+    """A mesh in a scene."""
+
+    mesh: "TriangleMesh"
+    keys: Float64
+    """(K, 4, 4), T_map_mesh at equidistant times 0..1; K = 1 at rest."""
+    enabled: bool
 
 
 def cast(
-    instances: "Mapping[int, Instance]",
+    instances: Mapping[int, Instance],
     origins: Float32,
     directions: Float32,
     times: np.ndarray,
@@ -43,7 +54,7 @@ def cast(
 
 
 def _keep_nearest(
-    entry: "Instance",
+    entry: Instance,
     number: int,
     rays: np.ndarray,
     origins: Float64,
@@ -86,7 +97,7 @@ def _pose_at(keys: Float64, times: np.ndarray) -> Float64:
     return (1.0 - fraction) * keys[segment] + fraction * keys[segment + 1]
 
 
-def closest(instances: "Mapping[int, Instance]", points: Float32, max_distance: float, found: "ClosestPoints") -> None:
+def closest(instances: Mapping[int, Instance], points: Float32, max_distance: float, found: "ClosestPoints") -> None:
     """Fill `found` by exhaustive search of each instance's triangles, moved to the map frame."""
     from simtrack.raycast.closest import search
 

@@ -182,8 +182,28 @@ def any_meets(lanes, directions, discs, met, count):
     return count == 0
 
 
+@nb.njit(cache=True, nogil=True)
+def _met_before(lanes, rays, instances, changed):
+    """Whether a ray of a packet met a changed instance; addresses of the packet's rays, and of what each ray met."""
+    order, found = carray(pointer(rays), len(lanes), np.int32), False
+    for k in range(len(lanes)):
+        found |= changed[carray(pointer(instances + 4 * np.intp(order[k])), 1, np.int32)[0]]
+    return found
+
+
+@nb.njit(cache=True, nogil=True)
+def _only_changed(listed, met, count, changed):
+    """Move those of the first `count` of `met` to the front whose instances have changed; returns their number."""
+    kept = 0
+    for k in range(count):
+        if changed[listed[met[k]]]:
+            met[k], met[kept] = met[kept], met[k]
+            kept += 1
+    return kept
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _bundle_chunk(chunk, lanes, world_fields, bundle_fields, discs, near, far, together, out):
+def _bundle_chunk(chunk, lanes, world_fields, bundle_fields, discs, near, far, together, changed, out):
     width, world, bundle = len(lanes), World(*world_fields), Bundle(*bundle_fields)
     packet, integers, valid = packets.new_packet(lanes, near, bundle.time)
     arguments = packets.arguments()
@@ -197,16 +217,22 @@ def _bundle_chunk(chunk, lanes, world_fields, bundle_fields, discs, near, far, t
     p_distances, p_normals, p_faces, p_instances = out
     pdiscs_of, met = packets.address(discs), np.empty(discs.shape[0], np.int64)
     blocks, cones = bundle.packed.shape[0], bundle.cones
+    # Where the discs do not tell where the others stand, and where the ground has changed, all is new.
+    anew = changed.shape[0] == 0 or cones.shape[0] == 0 or discs.shape[0] == 1 or changed[ground_id]
     packets.stand(lanes, p_packet, p_pose)
     for first in range(chunk * CHUNK, min((chunk + 1) * CHUNK, blocks), GROUP):
         flags, count = to_trace(world, cones, first // GROUP, discs, GROUP * width, met)
         if together >= 0:
             flags = flags & (OTHERS | GROUND) | (together * (OTHERS_COHERENT | GROUND_COHERENT))
+        moved = 0 if anew else _only_changed(world.listed, met, count, changed)
         for block in range(first, min(first + GROUP, blocks)):
             rays = p_order + 4 * block * width
+            directions = p_packed + 12 * block * width
+            touched = anew or _met_before(lanes, rays, p_instances, changed)
+            if not (touched or (moved and any_meets(lanes, directions, pdiscs_of, met, moved))):
+                continue
             packets.announce(lanes, block, rays, p_distances, p_normals, p_faces, p_instances)
             packets.reset(lanes, p_packet, far)
-            directions = p_packed + 12 * block * width
             aimed = flags & OTHERS and any_meets(lanes, directions, pdiscs_of, met, count)
             if aimed:
                 if apart:
@@ -251,22 +277,27 @@ def chunk_count(order, lanes):
 @nb.njit(cache=True, nogil=True)
 def cast_bundle(
     lanes, others, ground, ground_id, T_ground_map, listed, rows, motion, keys,
-    packed, order, cones, T_map_sensor, time, near, far, together, distances, normals, faces, instances,
+    packed, order, cones, T_map_sensor, time, near, far, together, changed, distances, normals, faces, instances,
 ):  # fmt: skip
-    """Nearest hits of a bundle, on the calling thread; `together` is 1 or 0 for `coherent`, -1 to decide by group."""
+    """Nearest hits of a bundle, on the calling thread.
+
+    `together` is 1 or 0 for `coherent`, -1 to decide by group. `changed` is empty, or holds a flag for each instance
+    id, and False at the end, which the number of a miss, -1, finds: then the outputs are those of an earlier call, and
+    only packets are traced for which such an instance makes a difference.
+    """
     world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
     pose, ground_pose = T_map_sensor[:3].astype(np.float32), product(T_ground_map, T_map_sensor)
     bundle = packed, order, cones, pose, ground_pose, np.float32(time)
     out = _addresses(distances, normals, faces, instances)
     discs = discs_of(World(*world), pose)
     for chunk in range(chunk_count(order, lanes)):
-        _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, out)
+        _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, changed, out)
 
 
 @nb.njit(cache=True, nogil=True, parallel=True)
 def cast_bundle_parallel(
     lanes, others, ground, ground_id, T_ground_map, listed, rows, motion, keys,
-    packed, order, cones, T_map_sensor, time, near, far, together, distances, normals, faces, instances,
+    packed, order, cones, T_map_sensor, time, near, far, together, changed, distances, normals, faces, instances,
 ):  # fmt: skip
     """`cast_bundle` on numba's threads."""
     world = others, ground, ground_id, T_ground_map, listed, rows, motion, keys
@@ -275,7 +306,7 @@ def cast_bundle_parallel(
     out = _addresses(distances, normals, faces, instances)
     discs = discs_of(World(*world), pose)
     for chunk in nb.prange(chunk_count(order, lanes)):
-        _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, out)
+        _bundle_chunk(chunk, lanes, world, bundle, discs, np.float32(near), np.float32(far), together, changed, out)
 
 
 # --------------------------------------------------------------------------------------------- rays of their own origin

@@ -1,7 +1,6 @@
 """A scene of mesh instances: cast rays at it, ask what is occluded and what lies nearest."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from threading import RLock
 from types import TracebackType
 
@@ -20,16 +19,6 @@ from simtrack.raycast.table import InstanceTable, checked_pose, checked_poses
 
 MAX_INSTANCE = 1 << 21
 """Instance ids are below this: tables are indexed by them."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Instance:
-    """A mesh in the scene, as the fallback needs it."""
-
-    mesh: TriangleMesh
-    keys: Float64
-    """(K, 4, 4), T_map_mesh at equidistant times 0..1; K = 1 at rest."""
-    enabled: bool
 
 
 class RayScene:
@@ -225,6 +214,7 @@ class RayScene:
         time: float = 0.0,
         coherent: bool | None = None,
         out: RayHits | None = None,
+        changed: Sequence[int] | None = None,
     ) -> RayHits:
         """Cast a bundle from one sensor pose.
 
@@ -238,9 +228,14 @@ class RayScene:
                 for rays some pixels apart on finely meshed things. None decides ray by ray, from the size of what they
                 may meet and its number of faces. The results are the same.
             out: results to overwrite and return (from `RayHits.empty`); saves the allocation.
+            changed: ids of the instances that were moved, shown or hidden since `out` was filled by this call with
+                otherwise the same arguments: only rays on which they can make a difference are traced. The results
+                are the same. None if `out` holds nothing.
         """
         T = checked_pose(T_map_sensor, "T_map_sensor")
         self.commit()
+        if changed is not None and out is None:
+            raise InvalidValueError("out", None, "the hits before the change, where `changed` is given")
         hits = RayHits.reuse(out, len(bundle))
         if self._hierarchy is None:
             rays = bundle.directions @ T[:3, :3].astype(np.float32).T
@@ -250,7 +245,8 @@ class RayScene:
         elif len(bundle):
             lanes, output = (0,) * bundle.packed.shape[2], (hits.distances, hits.normals, hits.faces, hits.instances)
             rays = bundle.packed, bundle.order, bundle.cones, T, float(time), float(min_distance), float(max_distance)
-            arguments = (lanes, *self._hierarchy.world, *rays, -1 if coherent is None else int(coherent), *output)
+            together, flags = -1 if coherent is None else int(coherent), self._flags(changed)
+            arguments = (lanes, *self._hierarchy.world, *rays, together, flags, *output)
             kernels.run(len(bundle), kernels.cast_bundle, kernels.cast_bundle_parallel, *arguments)
         return hits
 
@@ -288,8 +284,7 @@ class RayScene:
 
         T = checked_pose(T_map_sensor, "T_map_sensor")
         self.commit()
-        wanted = np.zeros(len(self._table.enabled) + 1, np.bool_)
-        wanted[[self._known(instance) for instance in instances]] = True
+        wanted = self._flags(instances)
         wanted[:-1] &= self._table.enabled
         room, rays = RayHits.empty(len(bundle.order)), np.empty(len(bundle.order), np.int32)
         count = 0
@@ -428,6 +423,13 @@ class RayScene:
             raise InvalidValueError("instance", instance, f"one of {self.instances}")
         return instance
 
+    def _flags(self, instances: Sequence[int] | None) -> Bool:
+        """True for the given ids, and False at the end, where the number of a miss points; nothing for None."""
+        flags = np.zeros(0 if instances is None else len(self._table.enabled) + 1, np.bool_)
+        if instances is not None:
+            flags[[self._known(instance) for instance in instances]] = True
+        return flags
+
     def _give_signs(self, points: Float32, found: ClosestPoints) -> None:
         from simtrack.raycast.topology import give_signs
 
@@ -438,9 +440,11 @@ class RayScene:
                 shape = mesh.vertices, mesh.faces, around.corners, around.across, around.ring_start, around.ring
                 give_signs(points, *shape, self._table.poses[number], chosen, found.faces, found.distances)
 
-    def _posed(self) -> dict[int, Instance]:
+    def _posed(self) -> dict[int, fallback.Instance]:
         poses, enabled = self._table.poses, self._table.enabled
         return {
-            number: Instance(mesh, self._motions.get(number, poses[number : number + 1]), bool(enabled[number]))
+            number: fallback.Instance(
+                mesh, self._motions.get(number, poses[number : number + 1]), bool(enabled[number])
+            )
             for number, mesh in self._meshes.items()
         }

@@ -68,3 +68,39 @@ def test_hidden_ones_occlude_nothing_and_are_not_met() -> None:
         assert len(scene.cast_at(bundle, T_MAP_SENSOR, [])) == 0
         with pytest.raises(InvalidValueError, match="instance = 99"):
             scene.cast_at(bundle, T_MAP_SENSOR, [ids[1], 99])
+
+
+@pytest.mark.parametrize("use_fallback", [False, True])
+@pytest.mark.parametrize("room", [np.eye(4), transform(exp_so3(np.array([0.0, 0.1, 0.4])))], ids=["identity", "posed"])
+def test_casting_anew_where_something_changed_is_casting(room: np.ndarray, use_fallback: bool) -> None:
+    """Whether instances were moved, into view or out of it, hidden or shown, and whether one is the ground."""
+    rng = np.random.default_rng(3)
+    bundles = [RayBundle.from_camera(CAMERA), RayBundle.from_directions(rng.normal(size=(2001, 3)))]
+    with RayScene(use_fallback) as scene:
+        ids = furnished(scene, room)
+        for bundle in bundles:
+            hits = scene.cast(bundle, T_MAP_SENSOR, coherent=True)
+            for step in range(8):
+                changed = rng.choice(ids[1:] if step < 6 else ids, 3, replace=False).tolist()
+                for number in changed[:2]:
+                    shift = transform(exp_so3(0.3 * rng.normal(size=3)), rng.normal(scale=0.3, size=3))
+                    scene.set_pose(number, scene.pose(number) @ shift)
+                scene.set_enabled(changed[2], not scene.enabled(changed[2]))
+                before = hits.instances.copy()
+                scene.cast(bundle, T_MAP_SENSOR, coherent=True, out=hits, changed=changed)
+                expected = scene.cast(bundle, T_MAP_SENSOR, coherent=True)
+                for name in ("distances", "normals", "faces", "instances"):
+                    np.testing.assert_array_equal(getattr(hits, name), getattr(expected, name))
+                assert step >= 6 or (before != hits.instances).any()
+            for number in ids:
+                scene.set_enabled(number, True)
+
+
+def test_what_changed_needs_the_hits_before() -> None:
+    with RayScene() as scene:
+        ids = furnished(scene, np.eye(4))
+        bundle = RayBundle.from_camera(CAMERA)
+        with pytest.raises(InvalidValueError, match="out"):
+            scene.cast(bundle, T_MAP_SENSOR, changed=ids[1:])
+        with pytest.raises(InvalidValueError, match="instance = 99"):
+            scene.cast(bundle, T_MAP_SENSOR, out=scene.cast(bundle, T_MAP_SENSOR), changed=[99])
