@@ -306,6 +306,14 @@ def _pack_pixels(pixels, image_width, columns, rows, fx, fy, cx, cy, width):
             start[digit] += 1
     for lane in range(n, packets * width):
         order[lane] = order[n - 1]
+    for p in range(packets):  # ascending, so that neighbours in a row of pixels are neighbours
+        for k in range(p * width + 1, (p + 1) * width):
+            i = order[k]
+            j = k
+            while j > p * width and order[j - 1] > i:
+                order[j] = order[j - 1]
+                j -= 1
+            order[j] = i
     packed = np.empty((packets, 3, width), np.float32)
     for p in range(packets):
         for k in range(width):

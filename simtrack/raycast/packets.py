@@ -20,6 +20,8 @@ from simtrack.raycast.vector import (
     prefetch,
     rotate,
     scatter,
+    scatter_vectors,
+    uniformity,
     unit_normals,
 )
 
@@ -97,7 +99,6 @@ def reset(lanes, packet, far):
     row = 4 * len(lanes)
     fill_float(lanes, packet + 8 * row, far)
     fill_int(lanes, packet + 17 * row, np.int32(-1))
-    fill_int(lanes, packet + 18 * row, np.int32(-1))
     fill_int(lanes, packet + 19 * row, np.int32(-1))
 
 
@@ -149,19 +150,16 @@ def turn_alike(lanes, packet, ground_id, rows, motion):
     That is nearly always the case, and then few vector operations do. `rows` and `motion` are the tables' addresses.
     """
     width = len(lanes)
-    faces = carray(pointer(packet + 68 * width), width, np.int32)
-    instances = carray(pointer(packet + 76 * width), width, np.int32)
     normals = packet + 48 * width
-    first, hit, alike = instances[0], faces[0] >= 0, True
-    for k in range(width):
-        alike &= (instances[k] == first) & ((faces[k] >= 0) == hit)
-    if not alike:
+    common = uniformity(lanes, packet + 76 * width, packet + 68 * width)
+    if common == 0:
         return False
-    if not hit:
+    if common == 1:
         fill_float(lanes, packet + 32 * width, np.float32(np.inf))
         for axis in range(3):
             fill_float(lanes, normals + 4 * axis * width, np.float32(0.0))
         return True
+    first = carray(pointer(packet + 76 * width), 1, np.int32)[0]
     met = ground_id if first < 0 else first  # the ground is no instance to Embree
     if carray(pointer(motion + 8 * met), 2, np.int32)[1] > 1:
         return False
@@ -200,24 +198,23 @@ def turn_mixed(lanes, packet, integers, ground_id, rows, motion, keys):
 def announce(lanes, block, order, distances, normals, faces, instances):
     """Begin to fetch where a packet's hits will be written: tracing takes long enough for that; see `write`.
 
-    Two lanes will do, other ones each time: neighbouring packets share cache lines.
+    Two lanes will do, other ones each time, and of the shorter arrays half of them: neighbours share cache lines.
     """
     half = len(lanes) // 2
     for lane in (block % half, block % half + half):
         ray = np.intp(carray(pointer(order + 4 * lane), 1, np.int32)[0])
-        prefetch(distances + 4 * ray)
-        prefetch(faces + 4 * ray)
-        prefetch(instances + 4 * ray)
         prefetch(normals + 12 * ray)
+        if ray & 4 == 0:
+            prefetch(distances + 4 * ray)
+            prefetch(faces + 4 * ray)
+            prefetch(instances + 4 * ray)
 
 
 @nb.njit(cache=True, nogil=True, inline="always")
 def write(lanes, packet, order, distances, normals, faces, instances):
     """Copy the hits of one packet to the outputs; all arguments are addresses, `order` that of the packet's rays."""
     row = 4 * len(lanes)
-    scatter(lanes, packet + 8 * row, order, distances, 1)
-    scatter(lanes, packet + 17 * row, order, faces, 1)
-    scatter(lanes, packet + 19 * row, order, instances, 1)
-    scatter(lanes, packet + 12 * row, order, normals, 3)
-    scatter(lanes, packet + 13 * row, order, normals + 4, 3)
-    scatter(lanes, packet + 14 * row, order, normals + 8, 3)
+    scatter(lanes, packet + 8 * row, order, distances)
+    scatter(lanes, packet + 17 * row, order, faces)
+    scatter(lanes, packet + 19 * row, order, instances)
+    scatter_vectors(lanes, packet + 12 * row, order, normals)

@@ -128,24 +128,81 @@ def _any_within(typing_context: Any, lanes: Any, directions: Any, axis: Any, cos
     return types.boolean(lanes, types.intp, types.intp, types.float32), generate
 
 
-def _scatter(typing_context: Any, lanes: Any, source: Any, order: Any, target: Any, stride: Any) -> Any:
-    """Intrinsic ``scatter(lanes, source, order, target, stride)``: copy a row of the packet to elements of an array.
+def _uniformity(typing_context: Any, lanes: Any, first: Any, second: Any) -> Any:
+    """Intrinsic ``uniformity(lanes, first, second)``: what the lanes of two rows of integers have in common.
 
-    Lane k goes to word ``stride * order[k]`` after `target`; `stride` is a literal number of words.
+    3: `first` is equal in all of them and `second` nowhere negative; 1: `second` is negative in all; 0: neither.
     """
-    if not isinstance(stride, types.IntegerLiteral):
-        return None
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
-        row, index, out = (builder.inttoptr(argument, _INT.as_pointer()) for argument in arguments[1:4])
-        for lane in range(lanes.count):
-            value = builder.load(builder.gep(row, [ir.Constant(_INT, lane)]), align=4)
-            element = builder.zext(builder.load(builder.gep(index, [ir.Constant(_INT, lane)]), align=4), _LONG)
-            at = builder.gep(out, [builder.mul(element, ir.Constant(_LONG, stride.literal_value))])
-            builder.store(value, at, align=4)
-        return context.get_dummy_value()
+        width = lanes.count
+        bits, none = ir.IntType(width), ir.Constant(ir.IntType(width), 0)
+        a, b = (builder.load(_vector_at(builder, at, _INT, width), align=4) for at in arguments[1:])
+        start = _splat(builder, builder.extract_element(a, ir.Constant(_INT, 0)), width)
+        unequal = builder.bitcast(builder.icmp_signed("!=", a, start), bits)
+        zeros = ir.Constant(ir.VectorType(_INT, width), None)
+        negative = builder.bitcast(builder.icmp_signed("<", b, zeros), bits)
+        alike = builder.icmp_unsigned("==", builder.or_(unequal, negative), none)
+        absent = builder.icmp_unsigned("==", builder.not_(negative), none)
+        three, one, zero = (ir.Constant(_LONG, value) for value in (3, 1, 0))
+        return builder.select(alike, three, builder.select(absent, one, zero))
 
-    return types.void(lanes, types.intp, types.intp, types.intp, stride), generate
+    return types.int64(lanes, types.intp, types.intp), generate
+
+
+def _scatter(rows: int) -> Any:
+    """Intrinsic ``scatter(lanes, source, order, target)``: `rows` rows of the packet to the rays' places in an array.
+
+    Lane k goes to words ``rows * order[k]`` and following. Four lanes whose rays are neighbours are written at once.
+    """
+
+    def scatter(typing_context: Any, lanes: Any, source: Any, order: Any, target: Any) -> Any:
+        def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
+            index, out = (builder.inttoptr(argument, _INT.as_pointer()) for argument in arguments[2:])
+            four = ir.VectorType(_INT, 4)
+            for lane in range(0, lanes.count, 4):
+                rays = builder.load(builder.bitcast(_word(builder, index, lane), four.as_pointer()), align=4)
+                first = builder.extract_element(rays, ir.Constant(_INT, 0))
+                row = builder.add(_splat(builder, first, 4), ir.Constant(four, [0, 1, 2, 3]))
+                apart = builder.bitcast(builder.icmp_signed("!=", rays, row), ir.IntType(4))
+                at = [_offset(builder, arguments[1], lane + k * lanes.count) for k in range(rows)]
+                values = [builder.load(_vector_at(builder, address, _INT, 4), align=4) for address in at]
+                with builder.if_else(builder.icmp_unsigned("==", apart, ir.Constant(ir.IntType(4), 0))) as (near, far):
+                    with near:
+                        place = builder.gep(out, [_times(builder, first, rows)])
+                        mixed = _interleaved(builder, values)
+                        builder.store(mixed, builder.bitcast(place, mixed.type.as_pointer()), align=4)
+                    with far:
+                        for k in range(4):
+                            ray = builder.extract_element(rays, ir.Constant(_INT, k))
+                            place = builder.gep(out, [_times(builder, ray, rows)])
+                            for number, value in enumerate(values):
+                                word = builder.extract_element(value, ir.Constant(_INT, k))
+                                builder.store(word, _word(builder, place, number), align=4)
+            return context.get_dummy_value()
+
+        return types.void(lanes, types.intp, types.intp, types.intp), generate
+
+    return scatter
+
+
+def _word(builder: ir.IRBuilder, pointer_: Any, number: int) -> Any:
+    return builder.gep(pointer_, [ir.Constant(_INT, number)])
+
+
+def _times(builder: ir.IRBuilder, ray: Any, rows: int) -> Any:
+    return builder.mul(builder.zext(ray, _LONG), ir.Constant(_LONG, rows))
+
+
+def _interleaved(builder: ir.IRBuilder, values: list[Any]) -> Any:
+    """Vectors x, y, z of four as one x0 y0 z0 x1 ... of twelve; a single one as it is."""
+    if len(values) == 1:
+        return values[0]
+    x, y, z = values
+    pairs = builder.shuffle_vector(x, y, ir.Constant(ir.VectorType(_INT, 8), list(range(8))))
+    padded = builder.shuffle_vector(z, z, ir.Constant(ir.VectorType(_INT, 8), [0, 1, 2, 3, 0, 1, 2, 3]))
+    places = [k + 4 * axis for k in range(4) for axis in range(3)]
+    return builder.shuffle_vector(pairs, padded, ir.Constant(ir.VectorType(_INT, 12), places))
 
 
 def _prefetch(typing_context: Any, address: Any) -> Any:
@@ -175,8 +232,13 @@ pointer: Any = intrinsic(_pointer_at)
 """``pointer(address)`` is what `carray` takes."""
 carray: Any = nb.carray  # pyright: ignore[reportPrivateImportUsage]
 """``carray(pointer(address), count, dtype)``: array of what stands at an address, without ownership."""
-scatter: Any = intrinsic(prefer_literal=True)(_scatter)
-"""``scatter(lanes, source, order, target, stride)``: lane k of a row goes to word ``stride * order[k]`` of `target`."""
+scatter: Any = intrinsic(_scatter(1))
+"""``scatter(lanes, source, order, target)``: lane k of a row goes to word ``order[k]`` after `target`."""
+scatter_vectors: Any = intrinsic(_scatter(3))
+"""``scatter_vectors(lanes, source, order, target)``: rows x, y, z; lane k goes to ``3 * order[k]`` and the next two."""
+uniformity: Any = intrinsic(_uniformity)
+"""``uniformity(lanes, first, second)``: 3 if `first` is the same in all lanes and `second` nowhere negative, 1 if that
+is negative in all lanes, else 0."""
 any_within: Any = intrinsic(_any_within)
 """``any_within(lanes, directions, axis, cosine)``: whether one of W directions lies in a cone of less than 90 deg."""
 prefetch: Any = intrinsic(_prefetch)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from simtrack.contracts import CameraIntrinsics
 from simtrack.errors import InvalidValueError
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
+from simtrack.raycast.kernels import GROUP
 
 CAMERA = CameraIntrinsics(64, 48, 60.0, 55.0, 31.0, 24.0)
 
@@ -102,3 +103,48 @@ def test_misuse_is_told() -> None:
         RayBundle.from_directions(np.eye(3), groups=[1])
     with pytest.raises(InvalidValueError, match="strides"):
         RayBundle.from_windows(CAMERA, [(0, 0, 5, 5)], [1, 2])
+
+
+def test_lanes_of_a_packet_are_in_the_callers_order() -> None:
+    """So that rays side by side in a row of pixels are side by side in a packet."""
+    shuffled = np.random.default_rng(0).permutation(64 * 48)[:1003]
+    for bundle in (RayBundle.from_camera(CAMERA), RayBundle.from_pixels(CAMERA, shuffled)):
+        assert (np.diff(bundle.order.reshape(-1, bundle.packed.shape[2]), axis=1) >= 0).all()
+
+
+def test_cones_hold_their_rays() -> None:
+    rng = np.random.default_rng(0)
+    bundles = [
+        RayBundle.from_camera(CAMERA),
+        RayBundle.from_windows(CAMERA, [(3, 5, 40, 33), (20, 10, 64, 48)], [1, 4]),
+        RayBundle.from_directions(rng.normal(size=(777, 3))),
+        RayBundle.from_directions(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])),
+        RayBundle.from_directions(np.tile([0.3, -2.0, 0.1], (100, 1))),
+    ]
+    for bundle in bundles:
+        width = bundle.packed.shape[2]
+        rays = bundle.directions[bundle.order].astype(float)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        group = np.arange(len(rays)) // (GROUP * width)
+        cones = bundle.cones.astype(float)
+        assert len(cones) == group[-1] + 1
+        assert (np.einsum("ij,ij->i", rays, cones[group, :3]) >= cones[group, 3] - 1e-6).all()
+        np.testing.assert_allclose(np.hypot(cones[:, 3], cones[:, 4]), 1.0, atol=1e-6)
+        np.testing.assert_allclose(cones[:, 5], 1.0 - cones[:, 3], atol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(cones[:, :3], axis=1), 1.0, atol=1e-6)
+
+
+@given(st.integers(0, 2**31), st.integers(1, 3))
+@settings(max_examples=40, deadline=None)
+def test_windows_hold_the_union_of_their_grids(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = rng.integers(-20, 80, (count, 2, 2))
+    windows = [(int(a[0]), int(a[1]), int(b[0]), int(b[1])) for a, b in np.sort(corners, axis=1)]
+    strides = rng.integers(1, 6, count).tolist()
+    bundle = RayBundle.from_windows(CAMERA, windows, strides)
+    expected = np.zeros((48, 64), bool)
+    v, u = np.mgrid[:48, :64]
+    for (u0, v0, u1, v1), step in zip(windows, strides, strict=True):
+        expected |= (u >= u0) & (u < u1) & (v >= v0) & (v < v1) & (u % step == 0) & (v % step == 0)
+    assert bundle.pixels is not None
+    np.testing.assert_array_equal(bundle.pixels, np.flatnonzero(expected))

@@ -136,6 +136,8 @@ class Registration:
         if far.any():
             batch.poses[far] = predicted[far]
             self._follow(batch, config.track_schedule, far)
+        if config.finish is not None:
+            self._follow(batch, (config.finish,), np.ones(len(batch.instances), bool))
         return batch.results(config)
 
     def _follow(self, batch: "_Batch", steps: Sequence[Step], chosen: npt.NDArray[np.bool_]) -> None:
@@ -178,7 +180,7 @@ class Registration:
         batch = self._batch(depth, intrinsics, {instance: T_camera_object}, fixed)
         if batch is None:
             return np.empty(0)
-        bundle, hits = self._cast(batch, 1)
+        bundle, hits = self._cast(batch, batch.strides)
         out = np.empty(len(bundle))
         count = kernels.ray_differences(bundle.pixels, hits.distances, hits.instances, depth, instance, reach, out)
         return out[:count]
@@ -189,7 +191,7 @@ class Registration:
         batch = self._batch(depth, intrinsics, {instance: T_camera_object}, None)
         if batch is not None:
             batch.strides[:] = 2
-            bundle, hits = self._cast(batch, 1)
+            bundle, hits = self._cast(batch, batch.strides)
             measured = depth.reshape(-1)[bundle.pixels]
             variance = kernels.axial_variance(float(T_camera_object[2, 3]), 0.8, self.config.focal_baseline)
             reach = self.config.schedule[-1].gate + 3.0 * np.sqrt(variance)
@@ -204,7 +206,7 @@ class Registration:
         fixed: Mapping[int, Float64] | None,
     ) -> "_Batch | None":
         """Show the given instances and no others; take up those of `poses` that project into the image."""
-        batch = _Batch(depth, intrinsics, self._models, poses, self.config.max_rays)
+        batch = _Batch(depth, intrinsics, self._models, poses, self.config)
         shown = {**(fixed or {}), **dict(zip(batch.instances, batch.poses, strict=True))}
         for instance in self._models:
             self._scene.set_enabled(instance, instance in shown)
@@ -213,12 +215,12 @@ class Registration:
             self._images = kernels.ModelImages.empty(*depth.shape)
         return batch if batch.instances else None
 
-    def _cast(self, batch: "_Batch", coarsen: int) -> tuple[RayBundle, RayHits]:
-        """Cast the rays of the active instances' windows."""
-        windows, strides = batch.windows[batch.active], coarsen * batch.strides[batch.active]
-        bundle = RayBundle.from_windows(batch.intrinsics, windows.tolist(), strides.tolist())
+    def _cast(self, batch: "_Batch", strides: npt.NDArray[np.int64]) -> tuple[RayBundle, RayHits]:
+        """Cast the rays of the active instances' windows, on pixel grids (K,)."""
+        windows, grids = batch.windows[batch.active], strides[batch.active]
+        bundle = RayBundle.from_windows(batch.intrinsics, windows.tolist(), grids.tolist())
         # Rays a few pixels apart meet other triangles of a fine mesh: they are no coherent packets.
-        hits = self._scene.cast(bundle, np.eye(4), coherent=False)
+        hits = self._scene.cast(bundle, np.eye(4), coherent=None if (grids == 1).all() else False)
         if len(bundle) > len(self._points.weight):
             self._points, self._edges = kernels.Points.room(len(bundle)), kernels.Edges.room(len(bundle))
         return bundle, hits
@@ -227,7 +229,8 @@ class Registration:
         """One outer iteration of the active instances: a cast, its correspondences, and solver steps on them."""
         config, count = self.config, len(batch.instances)
         batch.locate()
-        bundle, hits = self._cast(batch, step.coarsen)
+        strides = batch.fine_strides if step.fine else step.coarsen * batch.strides
+        bundle, hits = self._cast(batch, strides)
         pixels = bundle.pixels
         assert pixels is not None
         # Occluders that are not registered keep their rays: they are neither misses nor rows.
@@ -236,7 +239,6 @@ class Registration:
         rows = np.empty(len(bundle), np.int32)
         kernels.rows_of(hits.instances, row, rows)
         batch.counts[batch.active], batch.edges[batch.active] = 0, 0
-        strides = step.coarsen * batch.strides
         pairs = kernels.point_correspondences(
             pixels, bundle.directions, hits.distances, hits.normals, rows, batch.depth.reshape(-1),
             batch.depth.shape[1], strides, step.gate, 0.0, config.model_sigma, config.focal_baseline,
@@ -265,7 +267,7 @@ class _Batch:
         intrinsics: CameraIntrinsics,
         models: Mapping[int, TrackedModel],
         poses: Mapping[int, Float64],
-        max_rays: int,
+        config: RegistrationConfig,
     ) -> None:
         self.depth, self.intrinsics = np.ascontiguousarray(depth), intrinsics
         self.camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
@@ -274,7 +276,10 @@ class _Batch:
         if not inside.all():
             self._take(models, poses, [i for i, shown in zip(poses, inside, strict=True) if shown])
         area = (self.windows[:, 2] - self.windows[:, 0]) * (self.windows[:, 3] - self.windows[:, 1])
-        self.strides = np.where(area <= max_rays, 1, np.where(area <= 4 * max_rays, 2, 4))
+        self.strides, self.fine_strides = (
+            np.where(area <= limit, 1, np.where(area <= 4 * limit, 2, 4))
+            for limit in (config.max_rays, config.max_fine_rays)
+        )
         """(K,), pixel grids; chosen once for a registration, so that iterations do not alternate."""
         count = len(self.instances)
         self.active, self.moved, self.deviations = np.ones(count, bool), np.zeros(count), np.zeros(count)

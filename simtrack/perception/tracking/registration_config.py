@@ -23,6 +23,8 @@ class Step:
     """Take every so many-th row and column of each model's pixel grid."""
     repeats: int = 1
     """Cast again up to this often while an instance still moves by more than the configured tolerance."""
+    fine: bool = False
+    """Every pixel instead, of models whose windows are not too large: see `RegistrationConfig.max_fine_rays`."""
     silhouettes: Literal["always", "where-open", "never"] = "where-open"
     """Silhouettes widen the basin of convergence; they are coarse, so that in the end they only speak in directions
     that the faces leave open."""
@@ -52,6 +54,8 @@ class RegistrationConfig:
     near: Step = field(default=Step(gate=0.008, kernel=4.0, edge_reach=5, repeats=3))
     """What a track is tried with first: most predictions are so good that wide gates and silhouettes would only lead
     away from them."""
+    finish: Step | None = field(default=Step(gate=0.006, kernel=3.0, edge_reach=5, fine=True))
+    """How a track ends, near or not: a single cast at full resolution, from a pose that leaves little to be moved."""
     near_support: float = 0.9
     """It is enough for an instance that it leaves with no less support than this, ..."""
     near_misfit: float = 1.25
@@ -92,6 +96,9 @@ class RegistrationConfig:
     """As `systematic_translation`, radians."""
     max_rays: int = 2500
     """Coarser pixel grids are used for models whose image window holds more pixels than this."""
+
+    max_fine_rays: int = 20_000
+    """As `max_rays`, of fine steps."""
 
     def __post_init__(self) -> None:
         if self.solver not in ("gauss-newton", "umeyama"):

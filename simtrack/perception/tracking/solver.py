@@ -1,6 +1,6 @@
 """Solvers of the registration on fixed correspondences: robust Gauss-Newton, and the tracking paper's Umeyama fits.
 
-Compiled, all instances in one call; see `simtrack.perception.tracking.correspondences` for the residuals. Rotations are
+Compiled, all instances in one call; residuals are those of `simtrack.perception.tracking.normal_equations`. Rotations are
 scaled by the model's radius, so that all six directions are in metres of surface.
 """
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from simtrack.perception.tracking.correspondences import (
+from simtrack.perception.tracking.normal_equations import (
     edge_normal_equations,
     point_normal_equations,
     umeyama_sums,

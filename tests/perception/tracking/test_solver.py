@@ -2,12 +2,8 @@ import numpy as np
 
 from simtrack.geometry.transforms import exp_so3, perturb
 from simtrack.perception.tracking import solver
-from simtrack.perception.tracking.correspondences import (
-    Edges,
-    Points,
-    edge_normal_equations,
-    point_normal_equations,
-)
+from simtrack.perception.tracking.correspondences import Edges, Points
+from simtrack.perception.tracking.normal_equations import edge_normal_equations, point_normal_equations
 
 CAMERA = np.array([577.0, 577.0, 319.5, 239.5])
 
