@@ -51,9 +51,8 @@ class RegistrationConfig:
         Step(gate=0.006, kernel=3.0, edge_reach=5, repeats=2),
     )
     """Outer iterations from a prediction, as of a track."""
-    near: Step = field(default=Step(gate=0.008, kernel=4.0, edge_reach=5, repeats=3))
-    """What a track is tried with first: most predictions are so good that wide gates and silhouettes would only lead
-    away from them."""
+    near: Step = field(default=Step(gate=0.008, kernel=4.0, edge_reach=5, repeats=2, silhouettes="always"))
+    """What a track is tried with first: most predictions are so good that wide gates would only lead away from them."""
     finish: Step | None = field(default=Step(gate=0.006, kernel=3.0, edge_reach=5, fine=True))
     """How a track ends, near or not: a single cast at full resolution, from a pose that leaves little to be moved."""
     near_support: float = 0.9
@@ -66,7 +65,7 @@ class RegistrationConfig:
     """Solver steps on the same correspondences (the paper: 10 Umeyama fits)."""
     tolerance: float = 5e-5
     """An instance that an outer iteration moves by less than this has converged, metres of surface, ..."""
-    insignificant: float = 1.0
+    insignificant: float = 0.3
     """... and so has one that it moves by less than this many of its standard deviations."""
     settled: float = 1e-3
     """... and by less than this needs no other coarse iteration."""
