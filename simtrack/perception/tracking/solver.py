@@ -1,6 +1,6 @@
 """Solvers of the registration on fixed correspondences: robust Gauss-Newton, and the tracking paper's Umeyama fits.
 
-Compiled, all instances in one call; residuals are those of `simtrack.perception.tracking.normal_equations`. Rotations are
+Compiled, all instances in one call. See `simtrack.perception.tracking.normal_equations` for residuals. Rotations are
 scaled by the model's radius, so that all six directions are in metres of surface.
 """
 
