@@ -15,12 +15,16 @@ Definitions
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from simtrack.contracts import NANOSECONDS, Bool, Float64, Int32, LidarScan, Presegmentation, RgbdFrame, StaticMap
 from simtrack.evaluation.metrics import Metrics, ratio
 from simtrack.geometry.transforms import apply, interpolate
+
+if TYPE_CHECKING:
+    from simtrack.raycast import RayScene
 
 MARGIN = 0.02
 """Metres added to 3 sigma."""
@@ -49,28 +53,36 @@ class ModelledSurfaces:
 
     def __init__(self, static_map: StaticMap, objects: Mapping[str, tuple[Float64, Int32]]) -> None:
         """`objects`: name -> (vertices (V, 3) in the object frame, faces (F, 3)) of the catalogue objects."""
-        from simtrack.raycast import RayScene, TriangleMesh
-
-        self._scene = RayScene()
-        if len(static_map.faces):
-            self._scene.add(TriangleMesh(static_map.vertices, static_map.faces))
-        self._instances = {
-            name: self._scene.add(TriangleMesh(vertices, faces)) for name, (vertices, faces) in objects.items()
-        }
+        self._static_map, self._objects = static_map, dict(objects)
+        self._poses: dict[str, Float64] = {}
+        self._scene: RayScene | None = None
+        self._instances: dict[str, int] = {}
 
     def place(self, poses: Mapping[str, Float64]) -> None:
         """Set the objects' (4, 4) T_map_object."""
-        for name, instance in self._instances.items():
-            if name in poses:
-                self._scene.set_pose(instance, poses[name])
+        self._poses.update({name: T for name, T in poses.items() if name in self._objects})
 
     def distances(self, points: Float64, limit: float) -> Float64:
         """(N,) metres from (N, 3) points in the map frame to the closest surface, inf beyond `limit`."""
+        if self._scene is None:  # on first need: a run does not wait for it to start
+            self._scene = self._built()
+        self._scene.set_poses([self._instances[name] for name in self._poses], list(self._poses.values()))
         return np.asarray(self._scene.closest_points(points, limit).distances, dtype=float)
+
+    def _built(self) -> "RayScene":
+        from simtrack.raycast import RayScene, TriangleMesh
+
+        scene = RayScene()
+        if len(self._static_map.faces):
+            scene.add(TriangleMesh(self._static_map.vertices, self._static_map.faces))
+        for name, (vertices, faces) in self._objects.items():
+            self._instances[name] = scene.add(TriangleMesh(vertices, faces))
+        return scene
 
     def close(self) -> None:
         """Release the scene."""
-        self._scene.close()
+        if self._scene is not None:
+            self._scene.close()
 
 
 def camera_measurements(frame: RgbdFrame, T_map_camera: Float64, ids: Int32) -> Measurements:

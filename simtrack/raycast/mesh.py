@@ -118,6 +118,8 @@ def _validate(vertices: np.ndarray, faces: np.ndarray, source: str) -> None:
         raise MeshError(source, f"vertex {int(np.flatnonzero(~np.isfinite(vertices).all(1))[0])} is not finite")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(source, f"faces use indices {faces.min()}..{faces.max()}, valid are 0..{len(vertices) - 1}")
-    first = vertices[faces[:, 0]]
-    if not np.cross(vertices[faces[:, 1]] - first, vertices[faces[:, 2]] - first).any():
-        raise MeshError(source, "has no area: every triangle is degenerate")
+    for start in range(0, len(faces), 1024):
+        a, b, c = (vertices[faces[start : start + 1024, corner]] for corner in range(3))
+        if np.cross(b - a, c - a).any():
+            return
+    raise MeshError(source, "has no area: every triangle is degenerate")

@@ -195,10 +195,10 @@ class FloorPlan:
 
     def _update(self) -> None:
         import cv2
-        from scipy.ndimage import distance_transform_edt
 
-        open_cells = self.known & ~self.occupied & ~self.extra
-        self.clearance: Float64 = np.asarray(distance_transform_edt(open_cells)) * self.config.cell
+        open_cells = (self.known & ~self.occupied & ~self.extra).astype(np.uint8)
+        distances = cv2.distanceTransform(open_cells, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        self.clearance: Float64 = np.asarray(distances, dtype=np.float64) * self.config.cell
         """(rows, columns), metres from each cell to the nearest obstacle or unknown ground."""
         needed = self.config.radius + self.config.margin
         self.drivable: Bool = self.clearance > needed
