@@ -53,7 +53,8 @@ class RegistrationFromTruth:
                 self._instances[name] = len(self._instances)
                 self._registration.add(self._instances[name], self._models[class_name])
         poses = {self._instances[name]: T for name, (_, T) in starts.items()}
-        schedule = self._registration.config.track_schedule
+        config = self._registration.config
+        schedule = [*config.track_schedule, *([config.finish] if config.finish else [])]
         results = self._registration.register(frame.depth, frame.intrinsics, poses, schedule=schedule)
         return {
             name: results[number].T_camera_object
