@@ -123,8 +123,9 @@ class PerceptionStack:
         self._seconds: dict[str, float] = {}
 
     def close(self) -> None:
-        """Release the scenes' memory."""
+        """Release the scenes' memory, and end the threads that work beside the frames."""
         self.believed.close()
+        self.detections.close()
         if isinstance(self.tracker, ObjectTracker):
             self.tracker.close()
 

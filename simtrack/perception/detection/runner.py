@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from simtrack.contracts import (
@@ -46,7 +47,8 @@ class DetectorRunner:
         self.config = config or RunnerConfig()
         self._detector, self._models = detector, dict(models)
         self._free_at: int | None = None
-        self._waiting: list[tuple[DetectionResult, CameraIntrinsics]] = []
+        self._waiting: list[tuple[DetectionResult, Future[list[PoseHypothesis]]]] = []
+        self._solver: ThreadPoolExecutor | None = None
         self._hanging: threading.Thread | None = None
         self.status = Status.OK
 
@@ -66,19 +68,31 @@ class DetectorRunner:
             self.status = Status.DEGRADED
             return None
         self.status, self._free_at = result.status, max(result.available, frame.stamp + 1)
-        self._waiting.append((result, frame.intrinsics))
+        if self._solver is None:
+            self._solver = ThreadPoolExecutor(1, "simtrack-pnp")
+        # Until the answer is due there is time to solve for the poses.
+        self._waiting.append((result, self._solver.submit(self._hypotheses, result, frame.intrinsics)))
         return result
 
     def collect(self, now: int) -> list[PoseHypothesis]:
         """Pose hypotheses of all answers that are due at `now`, nanoseconds."""
         due = [w for w in self._waiting if w[0].available <= now]
         self._waiting = [w for w in self._waiting if w[0].available > now]
+        return [hypothesis for _, hypotheses in due for hypothesis in hypotheses.result()]
+
+    def close(self) -> None:
+        """End the thread that solves for poses; answers that are not collected yet are lost."""
+        self._waiting.clear()
+        if self._solver is not None:
+            self._solver.shutdown()
+            self._solver = None
+
+    def _hypotheses(self, result: DetectionResult, intrinsics: CameraIntrinsics) -> list[PoseHypothesis]:
         hypotheses: list[PoseHypothesis] = []
-        for result, intrinsics in due:
-            for detection in result.detections:
-                model = self._models.get(detection.class_name)
-                if model is not None and detection.keypoints.shape == (9, 2):
-                    hypotheses += solve_pose(detection, model, intrinsics, result.stamp, self.config.pnp)
+        for detection in result.detections:
+            model = self._models.get(detection.class_name)
+            if model is not None and detection.keypoints.shape == (9, 2):
+                hypotheses += solve_pose(detection, model, intrinsics, result.stamp, self.config.pnp)
         return hypotheses
 
     def _call(self, frame: RgbdFrame, regions: Sequence[RegionOfInterest]) -> DetectionResult | None:

@@ -48,6 +48,8 @@ class FitConfig:
     """A fit with a larger misfit than this is not believed."""
     modes: int = 3
     """Up to so many frequent depth differences are tried: the most frequent one may be that of an occluder."""
+    survivors: int = 4
+    """So many of the starts are gone on with after the first casts."""
     promising: float = 0.4
     """... unless it has even less support than this: nothing like the model is there."""
     retry_angle: float = np.deg2rad(14.0)
@@ -135,8 +137,18 @@ class Prober:
 
         Wide gates reach far but take what touches the object for the object; narrow ones do not. Both are tried.
         """
-        rough = [self._register(T, depth, intrinsics, steps) for T in starts for steps in (self._coarse, self._narrow)]
-        found = min((r for r in rough if r is not None), key=cost, default=None)
+        rough = [
+            (result, schedule[first:])
+            for T in starts
+            for schedule, first in ((self._coarse, 2), (self._narrow, 1))
+            if (result := self._register(T, depth, intrinsics, schedule[:first])) is not None
+        ]
+        rough.sort(key=lambda entry: cost(entry[0]))
+        finer = [
+            self._register(result.T_camera_object, depth, intrinsics, rest)
+            for result, rest in rough[: self._fit.survivors]
+        ]
+        found = min((r for r in finer if r is not None), key=cost, default=None)
         if found is None:
             return None
         settled = [self._register(found.T_camera_object, depth, intrinsics, s) for s in (self._refine, self._follow)]

@@ -90,8 +90,8 @@ def axial_variance(z: float, cosine: float, pixel_noise: float) -> float:
     ``f b = pixel_noise`` px m.
     """
     sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2
-    theta = np.arccos(min(1.0, max(cosine, 0.17364817766693033)))
-    if theta > np.pi / 3:
+    if cosine < 0.5:  # theta > pi / 3
+        theta = np.arccos(max(cosine, 0.17364817766693033))
         sigma += 0.0001 / np.sqrt(z) * theta * theta / (np.pi / 2 - theta) ** 2
     step = z * z / pixel_noise / 8.0
     return sigma * sigma + step * step / 12.0

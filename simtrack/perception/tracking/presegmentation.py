@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 from simtrack.contracts import (
     Bool,
@@ -27,6 +27,7 @@ from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import apply
 from simtrack.perception.tracking.correspondences import axial_variance
 from simtrack.raycast import RayBundle, RayScene
+from simtrack.raycast.kernels import run
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,8 @@ def presegment_camera(
     camera = np.array([K.fx, K.fy, K.cx, K.cy])
     normals = hits.normals @ T_map_camera[:3, :3].astype(np.float32)
     unknown, doubtful = np.zeros(depth.shape, bool), np.zeros(depth.shape, bool)
-    _unexplained_pixels(
+    run(
+        depth.size, _unexplained_pixels, _unexplained_pixels_parallel,
         depth, hits.distances.reshape(bundle.shape), normals.reshape(*bundle.shape, 3), camera, config.stride,
         config.map_sigma, config.tolerance, config.focal_baseline, unknown, doubtful,
     )  # fmt: skip
@@ -153,20 +155,74 @@ def presegment_lidar(
     return Presegmentation(scan.stamp, unknown, valid, labels, regions, "lidar")
 
 
-def shot_rays(scan: LidarScan, pose_at: Callable[[int], Float64]) -> tuple[Float64, Float64]:
+def shot_rays(scan: LidarScan, pose_at: Callable[[int], Float64]) -> tuple[Float32, Float32]:
     """Origins and unit directions (N, 3) of a scan's shots in the map, each from the sensor's pose at its own time."""
     last = float(scan.times.max()) if len(scan.times) else 0.0
     knots = np.linspace(0.0, max(last, 1e-6), 5)
     poses = np.stack([pose_at(scan.stamp + int(t * 1e9)) @ scan.T_base_lidar for t in knots])
-    position = np.clip(scan.times.astype(float) / knots[1], 0.0, 3.999999)
-    lower = position.astype(int)
-    fraction = (position - lower)[:, None]
-    d = scan.directions.astype(float)
-    a, b = poses[lower], poses[lower + 1]
-    directions = (1.0 - fraction) * np.einsum("nij,nj->ni", a[:, :3, :3], d)
-    directions += fraction * np.einsum("nij,nj->ni", b[:, :3, :3], d)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return (1.0 - fraction) * a[:, :3, 3] + fraction * b[:, :3, 3], directions
+    origins, directions = np.empty(scan.directions.shape, np.float32), np.empty(scan.directions.shape, np.float32)
+    _shoot(scan.directions, scan.times, knots[1], poses, origins, directions)
+    return origins, directions
+
+
+@njit(cache=True, nogil=True)
+def _shoot(shots, times, period, poses, origins, directions):
+    """Shots (N, 3) from poses (K, 4, 4) at multiples of `period`, between which all is interpolated linearly."""
+    for i in range(shots.shape[0]):
+        position = min(max(float(times[i]) / period, 0.0), poses.shape[0] - 1.000001)
+        lower = int(position)
+        share = position - lower
+        length = 0.0
+        for a in range(3):
+            ahead = 0.0
+            for b in range(3):
+                ahead += ((1.0 - share) * poses[lower, a, b] + share * poses[lower + 1, a, b]) * shots[i, b]
+            directions[i, a] = ahead
+            length += ahead * ahead
+            origins[i, a] = (1.0 - share) * poses[lower, a, 3] + share * poses[lower + 1, a, 3]
+        for a in range(3):
+            directions[i, a] /= np.sqrt(length)
+
+
+@njit(cache=True, nogil=True)
+def _unexplained_in_row(
+    v, depth, model_depth, normals, camera, stride, map_sigma, tolerance, focal_baseline, unknown, doubtful
+):  # fmt: skip
+    width = depth.shape[1]
+    rows, columns = model_depth.shape
+    for u in range(width):
+        d = depth[v, u]
+        if d <= 0.0:
+            continue
+        x, y = d * (u - camera[2]) / camera[0], d * (v - camera[3]) / camera[1]
+        variance = axial_variance(d, 0.9, focal_baseline)
+        sigma = np.sqrt(variance)
+        limit = min(3.0 * np.sqrt(variance + map_sigma * map_sigma), 2.5 * sigma + tolerance)
+        lateral = 2.0 * stride * d / camera[0] + 0.5 * limit
+        row, column = v // stride, u // stride
+        doubt = min(limit, sigma + 0.5 * tolerance)
+        nearest = 1e9
+        for ring in range(3):  # the pixel's own ray first: it explains nearly all
+            for b in range(-ring, ring + 1):
+                for a in range(-ring, ring + 1):
+                    if nearest < doubt or max(abs(a), abs(b)) != ring:
+                        continue
+                    i, j = row + b, column + a
+                    if i < 0 or j < 0 or i >= rows or j >= columns:
+                        continue
+                    z = model_depth[i, j]
+                    if not z < 1e6:
+                        continue
+                    ex = x - z * (j * stride - camera[2]) / camera[0]
+                    ey = y - z * (i * stride - camera[3]) / camera[1]
+                    ez = d - z
+                    off = abs(ex * normals[i, j, 0] + ey * normals[i, j, 1] + ez * normals[i, j, 2])
+                    if off < limit and ex * ex + ey * ey + ez * ez < lateral * lateral + 25.0 * off * off:
+                        nearest = min(nearest, off)
+            if nearest < doubt:
+                break
+        unknown[v, u] = nearest >= limit
+        doubtful[v, u] = nearest >= doubt
 
 
 @njit(cache=True, nogil=True)
@@ -177,42 +233,21 @@ def _unexplained_pixels(
 
     `doubtful` are those that are explained, but not closely, and the unknown ones.
     """
-    height, width = depth.shape
-    rows, columns = model_depth.shape
-    for v in range(height):
-        for u in range(width):
-            d = depth[v, u]
-            if d <= 0.0:
-                continue
-            x, y = d * (u - camera[2]) / camera[0], d * (v - camera[3]) / camera[1]
-            variance = axial_variance(d, 0.9, focal_baseline)
-            sigma = np.sqrt(variance)
-            limit = min(3.0 * np.sqrt(variance + map_sigma * map_sigma), 2.5 * sigma + tolerance)
-            lateral = 2.0 * stride * d / camera[0] + 0.5 * limit
-            row, column = v // stride, u // stride
-            doubt = min(limit, sigma + 0.5 * tolerance)
-            nearest = 1e9
-            for ring in range(3):  # the pixel's own ray first: it explains nearly all
-                for b in range(-ring, ring + 1):
-                    for a in range(-ring, ring + 1):
-                        if nearest < doubt or max(abs(a), abs(b)) != ring:
-                            continue
-                        i, j = row + b, column + a
-                        if i < 0 or j < 0 or i >= rows or j >= columns:
-                            continue
-                        z = model_depth[i, j]
-                        if not z < 1e6:
-                            continue
-                        ex = x - z * (j * stride - camera[2]) / camera[0]
-                        ey = y - z * (i * stride - camera[3]) / camera[1]
-                        ez = d - z
-                        off = abs(ex * normals[i, j, 0] + ey * normals[i, j, 1] + ez * normals[i, j, 2])
-                        if off < limit and ex * ex + ey * ey + ez * ez < lateral * lateral + 25.0 * off * off:
-                            nearest = min(nearest, off)
-                if nearest < doubt:
-                    break
-            unknown[v, u] = nearest >= limit
-            doubtful[v, u] = nearest >= doubt
+    for v in range(depth.shape[0]):
+        _unexplained_in_row(
+            v, depth, model_depth, normals, camera, stride, map_sigma, tolerance, focal_baseline, unknown, doubtful
+        )
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _unexplained_pixels_parallel(
+    depth, model_depth, normals, camera, stride, map_sigma, tolerance, focal_baseline, unknown, doubtful
+):  # fmt: skip
+    """`_unexplained_pixels` on numba's threads."""
+    for v in prange(depth.shape[0]):
+        _unexplained_in_row(
+            v, depth, model_depth, normals, camera, stride, map_sigma, tolerance, focal_baseline, unknown, doubtful
+        )
 
 
 @njit(cache=True, nogil=True)

@@ -20,8 +20,11 @@ class TrackerConfig:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
     fit: FitConfig = field(default_factory=FitConfig)
-    buffer: float = 0.5
+    buffer: float = 0.8
     """Depth images are kept this long for late detections, seconds."""
+    claim_time: float = 0.06
+    """A detection of something new, or that contradicts a track, is registered beside the frames for this long,
+    seconds of the sensor's clock."""
     confirm_detections: int = 2
     """Detections that a new object needs before it is believed; one is enough where the fit leaves no doubt."""
     confirm_frames: int = 3
@@ -111,6 +114,20 @@ class Target:
     def alive(self) -> bool:
         """Whether it takes part in registration."""
         return self.status is not TrackStatus.LOST
+
+    def vague(self, config: TrackerConfig) -> bool:
+        """Whether the depth image determines its orientation too poorly to outweigh detections."""
+        if self.result is None:
+            return True
+        variances = np.linalg.eigvalsh(self.result.covariance[3:, 3:])
+        return bool(variances[-1] > config.vague_rotation**2)
+
+    def doubtful(self, config: TrackerConfig) -> bool:
+        """Whether its last registration may have slid into a wrong minimum."""
+        result = self.result
+        return result is not None and (
+            result.support < config.doubtful_support or result.misfit > config.doubtful_misfit
+        )
 
 
 def tracked_model(model: ObjectModel) -> TrackedModel:

@@ -33,6 +33,7 @@ from simtrack.perception.tracking.association import (
     rotation_apart,
 )
 from simtrack.perception.tracking.birth import Occluders, Prober, believable, cost
+from simtrack.perception.tracking.claims import Claim, ClaimQueue
 from simtrack.perception.tracking.filter import Measurement, PoseFilter
 from simtrack.perception.tracking.registration import Registration, RegistrationResult
 from simtrack.perception.tracking.target import (
@@ -61,12 +62,14 @@ class ObjectTracker:
         self._tracked = {name: tracked_model(model) for name, model in self._models.items()}
         self._registration = Registration(self.config.registration)
         self._prober = Prober(self.config.registration, self.config.fit)
+        self._claims = ClaimQueue(self._prober, self._tracked, self.config.claim_time)
         self._targets: list[Target] = []
         self._next_id = 1
         self._views: deque[View] = deque()
 
     def close(self) -> None:
         """Release the scenes' memory."""
+        self._claims.close()
         self._registration.close()
         self._prober.close()
 
@@ -104,6 +107,7 @@ class ObjectTracker:
         status = Status.OK if np.any(depth) else Status.NO_DATA
         self._register(view)
         self._take_detections(hypotheses)
+        self._settle_claims(view.stamp)
         self._prune(view.stamp)
         return TrackerResult(frame.stamp, self._tracks(view), status)
 
@@ -153,7 +157,7 @@ class ObjectTracker:
     def _measure(self, target: Target, view: View, result: RegistrationResult, jump: float) -> None:
         """Fuse an accepted registration."""
         gap = view.stamp - target.last_seen > self.config.unseen_gap * NANOSECONDS
-        if gap and target.known and jump > self.config.displaced and self._vague(target):
+        if gap and target.known and jump > self.config.displaced and target.vague(self.config):
             # It was moved while nobody looked, and its surface alone does not tell how: detections have to.
             self._demote(target, view.stamp)
         measurement = self._measurement(view, result, target.last_seen)
@@ -173,7 +177,7 @@ class ObjectTracker:
         target.moved_when_seen = target.filter.state.moving
         target.score = min(0.99, target.score + 0.05)
         # A fit that leaves no doubt needs no second detection to be believed.
-        clear = not self._doubtful(target) and not self._vague(target)
+        clear = not target.doubtful(self.config) and not target.vague(self.config)
         told = target.detections >= (1 if clear else self.config.confirm_detections)
         fits = result.misfit <= self.config.fit.misfit
         enough = told and fits and target.frames >= self.config.confirm_frames
@@ -192,7 +196,7 @@ class ObjectTracker:
         turned = rotation_apart(m.T_map_object, T_before, target.model)
         if moved > self.config.fastest * span or turned > self.config.fastest_turn * span:
             return True
-        return self._vague(target) and target.filter.starts_to_move(m)
+        return target.vague(self.config) and target.filter.starts_to_move(m)
 
     @staticmethod
     def _demote(target: Target, stamp: int) -> None:
@@ -247,13 +251,24 @@ class ObjectTracker:
                 if i in pairs:
                     self._confirm(living[pairs[i]], poses[pairs[i]], group, view)
                 else:
-                    self._bear(group, view)
+                    self._claims.add(Claim(group, view, None))
+
+    def _settle_claims(self, now: int) -> None:
+        """Take the answer to the claim whose time is up, and begin with the next one."""
+        settled = self._claims.settle(now)
+        if settled is not None:
+            claim, result = settled
+            if result is not None and claim.target is None:
+                self._bear(claim, result)
+            elif result is not None:
+                self._contest(claim, result)
+        self._claims.work(now, self._views[0].stamp, lambda claim: self._around(claim.view, claim.target))
 
     def _confirm(self, target: Target, T_camera_object: Float64, group: list[PoseHypothesis], view: View) -> None:
         """Take a detection of a tracked object: fuse it, or let it contest an orientation that it disagrees with."""
         apart = [rotation_apart(h.T_camera_object, T_camera_object, target.model) for h in group]
         nearest = group[int(np.argmin(apart))]
-        limit = self.config.doubt if self._doubtful(target) else self.config.disagreement
+        limit = self.config.doubt if target.doubtful(self.config) else self.config.disagreement
         aside = beside(nearest.T_camera_object, T_camera_object) > self.config.beside * target.model.diameter
         if min(apart) <= limit and not aside:
             target.disagreements = 0
@@ -262,26 +277,14 @@ class ObjectTracker:
             self._fuse_late(target, T_camera_object, nearest, view)
             return
         target.disagreements += 1
-        unsettled = target.status is TrackStatus.TENTATIVE or view.stamp > target.last_seen or self._doubtful(target)
+        unsettled = (
+            target.status is TrackStatus.TENTATIVE or view.stamp > target.last_seen or target.doubtful(self.config)
+        )
         if unsettled or target.disagreements >= 2:
-            self._contest(target, T_camera_object, group, view)
-        if target.disagreements >= self.config.demote_after and self._vague(target):
+            self._claims.add(Claim(group, view, target))
+        if target.disagreements >= self.config.demote_after and target.vague(self.config):
             # Detections say again and again that it is otherwise, and the depth image cannot tell: no knowledge.
             self._demote(target, self._views[-1].stamp)
-
-    def _vague(self, target: Target) -> bool:
-        """Whether the depth image determines a track's orientation too poorly to outweigh detections."""
-        if target.result is None:
-            return True
-        variances = np.linalg.eigvalsh(target.result.covariance[3:, 3:])
-        return bool(variances[-1] > self.config.vague_rotation**2)
-
-    def _doubtful(self, target: Target) -> bool:
-        """Whether a track's last registration may have slid into a wrong minimum."""
-        result = target.result
-        return result is not None and (
-            result.support < self.config.doubtful_support or result.misfit > self.config.doubtful_misfit
-        )
 
     def _fuse_late(self, target: Target, T_camera_object: Float64, h: PoseHypothesis, view: View) -> None:
         """Fuse a detection's pose at its own stamp, unless it lies outside of its own error bounds."""
@@ -293,13 +296,13 @@ class ObjectTracker:
                 Measurement(view.stamp, view.T_map_camera @ T, rotate_covariance(R, h.covariance), np.zeros((6, 6)))
             )
 
-    def _contest(self, target: Target, T_camera_object: Float64, group: list[PoseHypothesis], view: View) -> None:
+    def _contest(self, claim: Claim, challenger: RegistrationResult) -> None:
         """Let a detection's pose and the track's compete for the better fit to the depth image of its stamp."""
-        model = self._tracked[target.model.name]
-        around = self._around(view, but=target)
-        challenger = self._prober.best(group, model, view.depth, view.intrinsics, around)
-        if challenger is None:
+        target, view = claim.target, claim.view
+        if target is None or not target.alive:
             return
+        T_camera_object = inverse(view.T_map_camera) @ target.filter.pose_at(view.stamp)
+        model, around = self._tracked[target.model.name], self._around(view, but=target)
         holder = self._prober.judge(T_camera_object, model, view.depth, view.intrinsics, around)
         # The more often detections have contradicted a pose, the better it has to fit to stay.
         margin = 1.3 / max(1.0, 0.5 * target.disagreements)
@@ -309,12 +312,9 @@ class ObjectTracker:
         if state is not None:
             target.filter, target.last_seen, target.disagreements = state, state.state.stamp, 0
 
-    def _bear(self, group: list[PoseHypothesis], view: View) -> None:
-        """Make a detection that no track explains a track, if a registered hypothesis is believable."""
-        model = self._models[group[0].class_name]
-        result = self._prober.best(group, self._tracked[model.name], view.depth, view.intrinsics, self._around(view))
-        if result is None:
-            return
+    def _bear(self, claim: Claim, result: RegistrationResult) -> None:
+        """Make a detection that no track explains a track: a registered hypothesis of it is believable."""
+        group, view, model = claim.group, claim.view, self._models[claim.class_name]
         T_map_object = view.T_map_camera @ result.T_camera_object
         for other in list(self._targets):
             T_other = other.filter.pose_at(view.stamp)
