@@ -115,7 +115,7 @@ class ColorRenderer(Protocol):
     """Makes the colour images of settled scenes; pixel centres at integer indices, as everywhere."""
 
     def begin(self, content: Content) -> None:
-        """Take over the next scene: upload what differs from the one before. What it shows depends on `content` only."""
+        """Take over the next scene; images depend on `content` alone, not on scenes before it."""
         ...
 
     def render(self, T_map_camera: Float64) -> Uint8:
