@@ -63,9 +63,7 @@ class Material:
     """How a surface looks, as in the metallic-roughness model of glTF 2.0."""
 
     texture: Uint8 | None = None
-    """(H, W, 3), sRGB, repeated; None = the mesh's face colours (grey if it has none)."""
-    palette: Uint8 | None = None
-    """(F, 3), colours by face instead of the mesh's own."""
+    """(H, W, 3), sRGB, repeated, row 0 at v = 0; None = the mesh's face colours, sRGB (grey if it has none)."""
     roughness: float = 0.7
     """0 = mirror, 1 = matt."""
     metallic: float = 0.0
@@ -77,7 +75,8 @@ class Shape:
     """One visible mesh of a scene."""
 
     mesh: Mesh
-    """Own frame before scaling, metres; the light visual mesh where rays meet a finer one of the same surface."""
+    """Own frame before scaling, metres, in its colours of this scene; the light visual mesh where rays meet a finer one
+    of the same surface."""
     T_map_mesh: Float64
     """(4, 4), with the scale in it."""
     material: Material
