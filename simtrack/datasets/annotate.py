@@ -1,13 +1,12 @@
-"""Labels of one view of a scene, all from rays at the true meshes: exact, and consistent with one another.
+"""Labels of one view of a scene, all from the true meshes at pixel centres: exact, and consistent with one another.
 
-The ids of an image come from one cast, so visible masks are disjoint by construction. An amodal mask is what the same
-rays meet of the instance alone; only pixels of its window that do not show it anyway are cast. What is seen is thereby
-part of the silhouette, whatever rounding does at edges.
+The ids of an image come from one cast of rays, so visible masks are disjoint by construction. An amodal mask is what
+the same rays would meet of the instance alone; which they are, the projections of its faces tell faster than rays do.
+What is seen is part of the silhouette, whatever rounding does at edges.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from simtrack.datasets.content import Placed
 from simtrack.datasets.frame import InstanceLabel
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import inverse
-from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
+from simtrack.raycast import RayBundle, RayHits, RayScene
 
 NEAR = 0.03
 """Metres along the optical axis; nearer surfaces are not in the image (that of MuJoCo's renderer here too)."""
@@ -77,7 +76,7 @@ class View:
 
 
 class Annotator:
-    """Labels views of scenes for one camera. Silhouettes are cast in scenes of one mesh each, kept as long as used."""
+    """Labels views of scenes for one camera."""
 
     def __init__(self, intrinsics: CameraIntrinsics, far: float = np.inf) -> None:
         """Create an annotator.
@@ -90,7 +89,6 @@ class Annotator:
         self._camera = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
         self._bundle: RayBundle | None = None
         self._hits: RayHits | None = None
-        self._alone: dict[int, tuple[TriangleMesh, RayScene]] = {}
 
     def look(self, rays: RayScene, owners: Owners, T_map_camera: Float64) -> View:
         """Ids, depth and normals of a view (4, 4), exact to float32 at every pixel centre."""
@@ -139,7 +137,9 @@ class Annotator:
         labels: list[InstanceLabel] = []
         for thing, (keypoints, visibility) in zip(things, points, strict=True):
             seen = tuple(boxes[thing.instance].tolist())
-            mask, total, valid, box = self._silhouette(thing, T_camera_map @ thing.T_map_mesh, ids, depth, seen)
+            mask = np.zeros(shape, np.bool_)
+            surface = thing.mesh.vertices, thing.mesh.faces, T_camera_map @ thing.T_map_mesh
+            total, valid, box = kernels.silhouette(*surface, self._camera, NEAR, seen, ids, thing.instance, depth, mask)
             labels.append(
                 InstanceLabel(
                     instance=thing.instance,
@@ -160,60 +160,6 @@ class Annotator:
                 )
             )
         return tuple(labels)
-
-    def close(self) -> None:
-        """Release Embree's structures; may be called twice."""
-        while self._alone:
-            self._alone.popitem()[1][1].close()
-
-    def __enter__(self) -> "Annotator":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    # ------------------------------------------------------------------------------------------------------ silhouettes
-
-    def _silhouette(
-        self, thing: Placed, T_camera_mesh: Float64, ids: Int32, depth: Float32, seen: tuple[int, int, int, int]
-    ) -> tuple[np.ndarray, int, int, tuple[int, int, int, int]]:
-        """Mask (H, W), pixels on the canvas, pixels inside with a reading, and box of a thing alone."""
-        from simtrack.datasets import label_kernels as kernels
-
-        width, height = self._intrinsics.width, self._intrinsics.height
-        mask = np.zeros((height, width), np.bool_)
-        low_u, low_v, high_u, high_v = kernels.projected_box(
-            thing.mesh.vertices, thing.mesh.faces, T_camera_mesh, self._camera, NEAR
-        )
-        window = (0, 0, -1, -1)
-        if low_u <= high_u:
-            canvas = (-width, -height, 2 * width - 1, 2 * height - 1)
-            window = (
-                int(np.floor(np.clip(low_u, canvas[0], canvas[2] + 1))),
-                int(np.floor(np.clip(low_v, canvas[1], canvas[3] + 1))),
-                int(np.ceil(np.clip(high_u, canvas[0] - 1, canvas[2]))),
-                int(np.ceil(np.clip(high_v, canvas[1] - 1, canvas[3]))),
-            )
-        T_mesh_camera = np.linalg.inv(T_camera_mesh)
-        linear = np.ascontiguousarray(T_mesh_camera[:3, :3])
-        pixels, directions = kernels.hidden_rays(window, ids, thing.instance, linear, self._camera)
-        met = np.zeros(0, np.bool_)
-        if len(directions):
-            origins = np.broadcast_to(T_mesh_camera[:3, 3].astype(np.float32), directions.shape)
-            met = self._scene_of(thing.mesh).occluded(origins, directions, np.inf, min_distance=NEAR)
-        total, valid, box = kernels.fill_silhouette(seen, ids, thing.instance, depth, pixels, met, mask)
-        return mask, total, valid, box
-
-    def _scene_of(self, mesh: TriangleMesh) -> RayScene:
-        """A scene that holds a mesh alone, where its own frame is."""
-        kept = self._alone.get(id(mesh))
-        if kept is None:
-            scene = RayScene()
-            scene.add(mesh)
-            self._alone[id(mesh)] = kept = mesh, scene
-        return kept[1]
 
     # -------------------------------------------------------------------------------------------------------- keypoints
 

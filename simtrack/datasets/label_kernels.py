@@ -53,92 +53,145 @@ def visible_parts(ids, count):
     return pixels, boxes
 
 
-@njit(cache=True, nogil=True)
-def _widen(box, u, v):
-    box[0], box[1] = min(box[0], u), min(box[1], v)
-    box[2], box[3] = max(box[2], u), max(box[3], v)
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
-def projected_box(vertices, faces, T_camera_mesh, camera, near):
-    """(4,) u0, v0, u1, v1 in pixels of what of a mesh lies beyond the near plane; u1 < u0 if nothing does."""
-    fx, fy, cx, cy = camera
-    T = T_camera_mesh
-    count = vertices.shape[0]
-    points = np.empty((count, 3))
-    box = np.array([np.inf, np.inf, -np.inf, -np.inf])
-    crosses = False
-    for i in range(count):
-        a, b, c = np.float64(vertices[i, 0]), np.float64(vertices[i, 1]), np.float64(vertices[i, 2])
-        for k in range(3):
-            points[i, k] = T[k, 0] * a + T[k, 1] * b + T[k, 2] * c + T[k, 3]
-        if points[i, 2] >= near:
-            _widen(box, fx * points[i, 0] / points[i, 2] + cx, fy * points[i, 1] / points[i, 2] + cy)
-        else:
-            crosses = True
-    if crosses:
-        for f in range(faces.shape[0]):
-            for k in range(3):
-                p, q = points[faces[f, k]], points[faces[f, (k + 1) % 3]]
-                if (p[2] >= near) != (q[2] >= near):
-                    s = (near - p[2]) / (q[2] - p[2])
-                    x, y = p[0] + s * (q[0] - p[0]), p[1] + s * (q[1] - p[1])
-                    _widen(box, fx * x / near + cx, fy * y / near + cy)
-    return box
+def silhouette(vertices, faces, T_camera_mesh, camera, near, seen_box, ids, own, depth, mask):
+    """Every pixel whose centre lies in the projection of a face: what rays meet of a mesh that stands alone.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def hidden_rays(window, ids, own, R_mesh_camera, camera):
-    """Where in a window (u0, v0, u1, v1, last pixel included) an instance is not seen, but may be behind something.
+    Pixels that show the instance `own` in `ids` (H, W), which lie in `seen_box` (u0, v0, u1, v1), belong to it whatever
+    rounding says. The part inside the image is written into `mask` (H, W), which is False everywhere.
 
     Returns:
-        Pixels (N, 2) and directions (N, 3) in the mesh's frame, of the length that has z = 1 in the camera's; in tiles
-        of 4x4 pixels, so that neighbouring rays stay together.
-    """
-    fx, fy, cx, cy = camera
-    height, width = ids.shape
-    u0, v0, u1, v1 = window
-    R = R_mesh_camera.astype(np.float32)
-    room = max(0, u1 - u0 + 1) * max(0, v1 - v0 + 1)
-    pixels, directions = np.empty((room, 2), np.int32), np.empty((room, 3), np.float32)
-    n = 0
-    for top in range(v0, v1 + 1, 4):
-        for left in range(u0, u1 + 1, 4):
-            for v in range(top, min(top + 4, v1 + 1)):
-                for u in range(left, min(left + 4, u1 + 1)):
-                    if 0 <= u < width and 0 <= v < height and ids[v, u] == own:
-                        continue
-                    x, y = np.float32((u - cx) / fx), np.float32((v - cy) / fy)
-                    pixels[n, 0], pixels[n, 1] = u, v
-                    for k in range(3):
-                        directions[n, k] = R[k, 0] * x + R[k, 1] * y + R[k, 2]
-                    n += 1
-    return pixels[:n], directions[:n]
-
-
-@njit(cache=True, nogil=True)
-def fill_silhouette(visible_box, ids, own, depth, pixels, met, mask):
-    """Write the silhouette's part inside the image into `mask` (H, W), which is False everywhere.
-
-    Returns:
-        Pixels of the whole silhouette, those of them inside the image with a reading in `depth`, and the box (u0, v0,
-        u1, v1) of the whole.
+        Pixels of the whole on the canvas of three images by three, those inside the image with a reading in `depth`
+        (H, W), and the box (u0, v0, u1, v1) of the whole; u1 < u0 without a pixel.
     """
     height, width = ids.shape
-    total, valid = 0, 0
-    u0, v0, u1, v1 = visible_box
-    for v in range(v0, v1 + 1):
-        for u in range(u0, u1 + 1):
-            if ids[v, u] == own:
-                mask[v, u] = True
+    points, bounds, crosses = _project(vertices, faces, T_camera_mesh, camera, near)
+    u0, v0 = int(max(np.ceil(bounds[0]), -width)), int(max(np.ceil(bounds[1]), -height))
+    u1, v1 = int(min(np.floor(bounds[2]), 2 * width - 1)), int(min(np.floor(bounds[3]), 2 * height - 1))
+    if seen_box[2] >= seen_box[0]:
+        u0, v0, u1, v1 = min(u0, seen_box[0]), min(v0, seen_box[1]), max(u1, seen_box[2]), max(v1, seen_box[3])
+    canvas = np.zeros((max(v1 - v0 + 1, 0), max(u1 - u0 + 1, 0)), np.bool_)
+    if canvas.size:
+        _cover(points, faces, camera, near, crosses, u0, v0, canvas)
+    total, valid, left, right, top, bottom = 0, 0, u1 + 1, u0 - 1, v1 + 1, v0 - 1
+    for v in range(v0, v0 + canvas.shape[0]):
+        inside = 0 <= v < height
+        for u in range(u0, u0 + canvas.shape[1]):
+            here = inside and 0 <= u < width
+            if canvas[v - v0, u - u0] or (here and ids[v, u] == own):
                 total += 1
-                valid += depth[v, u] > 0.0
-    for k in range(pixels.shape[0]):
-        if met[k]:
-            u, v = pixels[k, 0], pixels[k, 1]
-            total += 1
-            u0, v0, u1, v1 = min(u0, u), min(v0, v), max(u1, u), max(v1, v)
-            if 0 <= u < width and 0 <= v < height:
-                mask[v, u] = True
-                valid += depth[v, u] > 0.0
-    return total, valid, (u0, v0, u1, v1)
+                left, right, top, bottom = min(left, u), max(right, u), min(top, v), v
+                if here:
+                    mask[v, u] = True
+                    valid += depth[v, u] > 0.0
+    return total, valid, (left, top, right, bottom)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project(vertices, faces, T, camera, near):
+    """Of a mesh's vertices, (V, 3): pixels u, v and depth, or x, y and depth short of the near plane, with bounds.
+
+    Bounds (4,) are u0, v0, u1, v1 of what lies beyond the near plane; the last result is whether it cuts the mesh.
+    """
+    fx, fy, cx, cy = camera
+    points, bounds = np.empty((vertices.shape[0], 3)), np.array([np.inf, np.inf, -np.inf, -np.inf])
+    some, all_ = False, True
+    for i in range(vertices.shape[0]):
+        a, b, c = np.float64(vertices[i, 0]), np.float64(vertices[i, 1]), np.float64(vertices[i, 2])
+        x = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+        y = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        if z >= near:
+            x, y = fx * x / z + cx, fy * y / z + cy
+            bounds[0], bounds[2] = min(bounds[0], x), max(bounds[2], x)
+            bounds[1], bounds[3] = min(bounds[1], y), max(bounds[3], y)
+            some = True
+        else:
+            all_ = False
+        points[i, 0], points[i, 1], points[i, 2] = x, y, z
+    crosses = some and not all_
+    if crosses:
+        corner = np.empty((4, 2))
+        for f in range(faces.shape[0]):
+            for k in range(_clip(points, faces[f], camera, near, corner)):
+                bounds[0], bounds[2] = min(bounds[0], corner[k, 0]), max(bounds[2], corner[k, 0])
+                bounds[1], bounds[3] = min(bounds[1], corner[k, 1]), max(bounds[3], corner[k, 1])
+    if not some:
+        bounds[:] = np.array([0.0, 0.0, -1.0, -1.0])
+    return points, bounds, crosses
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _clip(points, face, camera, near, corner):
+    """Write the pixels of the part of a face beyond the near plane, 0, 3 or 4 corners, and return their number."""
+    fx, fy, cx, cy = camera
+    count = 0
+    for k in range(3):
+        p, q = points[face[k]], points[face[(k + 1) % 3]]
+        if p[2] >= near:
+            corner[count, 0], corner[count, 1] = p[0], p[1]
+            count += 1
+        if (p[2] >= near) != (q[2] >= near):
+            # Vertices beyond the plane are kept in pixels, those before it in metres.
+            px, py = (p[0], p[1]) if p[2] < near else ((p[0] - cx) / fx * p[2], (p[1] - cy) / fy * p[2])
+            qx, qy = (q[0], q[1]) if q[2] < near else ((q[0] - cx) / fx * q[2], (q[1] - cy) / fy * q[2])
+            share = (near - p[2]) / (q[2] - p[2])
+            corner[count, 0] = fx * (px + share * (qx - px)) / near + cx
+            corner[count, 1] = fy * (py + share * (qy - py)) / near + cy
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cover(points, faces, camera, near, crosses, u0, v0, canvas):
+    """Set the pixels of the canvas, whose first one is (u0, v0), that the faces cover."""
+    corner = np.empty((4, 2))
+    for f in range(faces.shape[0]):
+        if crosses:
+            for k in range(2, _clip(points, faces[f], camera, near, corner)):
+                _cover_triangle(
+                    corner[0, 0] - u0, corner[0, 1] - v0, corner[k - 1, 0] - u0, corner[k - 1, 1] - v0,
+                    corner[k, 0] - u0, corner[k, 1] - v0, canvas,
+                )  # fmt: skip
+            continue
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        _cover_triangle(
+            points[i, 0] - u0, points[i, 1] - v0, points[j, 0] - u0, points[j, 1] - v0,
+            points[k, 0] - u0, points[k, 1] - v0, canvas,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cover_triangle(ax, ay, bx, by, cx, cy, canvas):
+    """Set the pixels whose centres lie in a triangle or on its border, row by row; the canvas begins at (0, 0).
+
+    Triangles that share an edge compute the same crossing of it with a row, so nothing is left out between them.
+    """
+    left, right = min(min(ax, bx), cx), max(max(ax, bx), cx)
+    top, bottom = min(min(ay, by), cy), max(max(ay, by), cy)
+    first, last = int(max(np.ceil(left), 0.0)), int(min(right, canvas.shape[1] - 1.0))
+    if right < first or last < first:
+        return
+    upper, lower = int(max(np.ceil(top), 0.0)), int(min(bottom, canvas.shape[0] - 1.0))
+    if bottom < upper:
+        return
+    turns = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) >= 0.0
+    # Of each edge: where it is highest up, how far it goes sideways a row, and whether it bounds rows to the right.
+    x0, y0, slope0 = (ax, ay, (bx - ax) / (by - ay)) if ay <= by else (bx, by, (ax - bx) / (ay - by))
+    x1, y1, slope1 = (bx, by, (cx - bx) / (cy - by)) if by <= cy else (cx, cy, (bx - cx) / (by - cy))
+    x2, y2, slope2 = (cx, cy, (ax - cx) / (ay - cy)) if cy <= ay else (ax, ay, (cx - ax) / (cy - ay))
+    ends0, ends1, ends2 = (by > ay) == turns, (cy > by) == turns, (ay > cy) == turns
+    for row in range(upper, lower + 1):
+        low, high = float(first), float(last)
+        if ay != by:
+            x = x0 + slope0 * (row - y0)
+            low, high = (low, min(high, x)) if ends0 else (max(low, x), high)
+        if by != cy:
+            x = x1 + slope1 * (row - y1)
+            low, high = (low, min(high, x)) if ends1 else (max(low, x), high)
+        if cy != ay:
+            x = x2 + slope2 * (row - y2)
+            low, high = (low, min(high, x)) if ends2 else (max(low, x), high)
+        if low <= high:
+            for column in range(int(np.ceil(low)), int(high) + 1):
+                canvas[row, column] = True
