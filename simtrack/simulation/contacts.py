@@ -46,4 +46,4 @@ def support_tree(
 ) -> tuple[tuple[str, str], ...]:
     """(carried, carrier) by name, see `contact_pairs`."""
     supports, _ = contact_pairs(data, owners, movable)
-    return tuple((names[carried], names[carrier]) for carried, carrier in supports.tolist())
+    return tuple((names[int(carried)], names[int(carrier)]) for carried, carrier in supports.tolist())
