@@ -1,0 +1,48 @@
+"""A recording that is one sensor's frames and perhaps its poses: what folders of images and packet captures hold."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from simtrack.contracts import Float64, LidarScan, RgbdFrame
+from simtrack.objects import ObjectModel
+
+
+class RecordingWarning(UserWarning):
+    """A recording that can be used, but not as a whole, or not without an assumption."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedFrame:
+    """A frame, and where its sensor was if the recording says so."""
+
+    frame: RgbdFrame | LidarScan
+    """The sensor is its own base: T_base_camera or T_base_lidar is the identity."""
+    T_map_sensor: Float64 | None = None
+    """(4, 4), as stated by the recording, in its own fixed frame; None if it says nothing of this frame."""
+    objects: Mapping[str, Float64] = field(default_factory=dict)
+    """Labelled poses of the objects in it, T_map_object (4, 4) by instance, ``class-1``: not for estimators."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorLog:
+    """The frames of one sensor. They are read when asked for, one at a time."""
+
+    path: Path
+    format: str
+    """For people: ``TUM RGB-D folder``."""
+    sensor: Literal["camera", "lidar"]
+    count: int | None
+    """Number of frames, None where only reading all of it would tell."""
+    read: Callable[[], Iterator[PosedFrame]]
+    """Frames in order, anew at each call. Raises `FileFormatError` for a frame that is damaged."""
+    models: Mapping[str, ObjectModel] = field(default_factory=dict)
+    """Object models that come with it, by name."""
+    noise: float = 0.0
+    """Metres, standard deviation of a lidar range as the sensor's data sheet states it; 0 for a camera."""
+
+    def sensor_frames(self) -> Iterator[RgbdFrame | LidarScan]:
+        """The frames without what is stated of their poses."""
+        for entry in self.read():
+            yield entry.frame
