@@ -137,7 +137,9 @@ def _add_light(spec: "mujoco.MjSpec", light: Light) -> None:
     if light.directional:
         added.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     else:
-        added.type = mujoco.mjtLightType.mjLIGHT_POINT
+        # Its classic renderer leaves point lights out; a spot light that shines everywhere is one.
+        added.type = mujoco.mjtLightType.mjLIGHT_SPOT
+        added.cutoff, added.exponent = 180.0, 0.0
         added.attenuation = [0.0, 0.0, 1.0 / light.reach**2]
 
 

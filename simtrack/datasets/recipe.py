@@ -142,11 +142,11 @@ class LightSettings(Strict):
     count: tuple[Annotated[int, Field(ge=0, le=6)], Annotated[int, Field(ge=0, le=6)]] = (1, 3)
     distance: Lengths = (1.0, 1.8)
     elevation: tuple[Elevation, Elevation] = (0.3, 1.5)
-    intensity: tuple[Intensity, Intensity] = (0.4, 0.9)
+    intensity: tuple[Intensity, Intensity] = (0.5, 1.2)
     """All lights together: what a white surface shows that faces them; 1 saturates."""
     color: Shares = (0.8, 1.0)
     """Of each channel; the strongest is scaled to 1."""
-    ambient: Shares = (0.2, 0.5)
+    ambient: Shares = (0.25, 0.6)
     directional: Share = 0.3
     """Share of lights that shine like the sun, from one direction everywhere."""
     radius: tuple[Annotated[float, Field(ge=0.0, le=1.0)], Annotated[float, Field(ge=0.0, le=1.0)]] = (0.02, 0.15)
