@@ -20,6 +20,7 @@ from simtrack.contracts import (
     StaticMap,
     Uint8,
 )
+from simtrack.geometry.kinematics import KinematicTree
 from simtrack.objects import ObjectModel
 
 
@@ -176,6 +177,8 @@ class SceneInfo:
     frames: int
     static_map: StaticMap | None = None
     """The estimator's map, where a robot drives."""
+    robot: KinematicTree | None = None
+    """The robot's body, if there is one; `LabelledFrame.joints` moves it."""
 
 
 def no_labels() -> np.ndarray:
