@@ -10,6 +10,8 @@ from simtrack.objects import ObjectModel, Symmetries, shapes
 from simtrack.objects.model import build_model
 from simtrack.objects.shapes import Solid
 
+ANY_CLASS = "artifact"
+"""Semantic class of a shape without a name."""
 DENSITY = 400.0
 """kg/m^3, of a hollow thing of plastic or a solid one of wood."""
 
@@ -24,7 +26,7 @@ def primitive(settings: PrimitiveSettings, rng: np.random.Generator) -> ObjectMo
     # What a solid of two boxes weighs does not matter to a thousandth; that it is closed does.
     mass = max(0.01, DENSITY * meshes.volume(mesh))
     return build_model(
-        name=kind, semantic_class="artifact", mesh=mesh, visual=mesh,
+        name=kind, semantic_class=ANY_CLASS, mesh=mesh, visual=mesh,
         collision=[meshes.convex_hull(part.mesh().vertices) for part in parts],
         mass=mass, friction=0.6, symmetries=Symmetries(), trackable=False,
     )  # fmt: skip

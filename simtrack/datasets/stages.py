@@ -1,21 +1,30 @@
 """Where a scene of a data set takes place: a random room, or the building of a scene file."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Set
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from simtrack.contracts import Room
+from simtrack.contracts import MapEntity, Room
+from simtrack.datasets.frame import StuffCategory
 from simtrack.datasets.recipe import ArrangePlacement, DropPlacement, Recipe, RoomWorld, SceneWorld
 from simtrack.errors import FileFormatError, SimtrackError
+from simtrack.sensors.depth_noise import PRESETS, DepthNoiseConfig
 from simtrack.simulation.building import furniture
 from simtrack.simulation.building.parts import StaticPart, StaticWorld
 from simtrack.simulation.building.shell import room_shell
 from simtrack.simulation.placement import Area, support_area
 from simtrack.simulation.scene_file import SceneFile, load_scene
-from simtrack.simulation.world import build_static
+from simtrack.simulation.world import build_static, configured
 
 EDGE = 0.4
 """Metres: longest triangle edge on the walls of a random room."""
+SHEET = 0.001
+"""Metres: thickness of walls and floors in relations."""
+FAR = 10.0
+"""Metres beyond which clean depth shows nothing."""
+OTHER = "other"
+"""Stuff category of classes that only some seeds have."""
 FLOOR_MARGIN = 0.3
 """Metres that things on a room's floor keep from its walls."""
 
@@ -41,6 +50,12 @@ def scene_of(recipe: Recipe, number: int) -> SceneFile:
         return load_scene(beside if beside.is_dir() else world.scene)
     except SimtrackError as error:
         raise FileFormatError(recipe.path, f"worlds.{number}.scene", str(error)) from error
+
+
+def depth_noise(recipe: Recipe) -> DepthNoiseConfig:
+    """The depth camera's errors; raises FileFormatError for fields and values that they do not take."""
+    base = PRESETS[recipe.camera.depth]
+    return configured(DepthNoiseConfig, recipe.camera.depth_noise, recipe, "camera.depth_noise", base)
 
 
 def build_stage(recipe: Recipe, number: int, scene: SceneFile | None, rng: np.random.Generator) -> Stage:
@@ -97,6 +112,36 @@ def _room(world: RoomWorld, rng: np.random.Generator) -> tuple[StaticWorld, str]
 
 def _with_support(part: StaticPart, face: tuple[np.ndarray, np.ndarray]) -> StaticPart:
     """The room's only piece of floor as something to stand on; other parts as they are."""
-    from dataclasses import replace
-
     return replace(part, supports=(face,)) if part.semantic_class == "floor" else part
+
+
+# ----------------------------------------------------------------------------------------------------------- categories
+
+
+def stuff_categories(static: Set[str], loose: Set[str], taken: int) -> dict[tuple[str, bool], StuffCategory]:
+    """(semantic class, whether its instances are told apart) -> category, numbered after the `taken` ones."""
+    keys = [(name, False) for name in (*sorted(static - {OTHER}), OTHER)] + [(name, True) for name in sorted(loose)]
+    return {
+        (name, thing): StuffCategory(number, f"loose-{name}" if thing and name in static else name, thing)
+        for number, (name, thing) in enumerate(keys, start=taken + 1)
+    }
+
+
+def category_of(stuff: Mapping[tuple[str, bool], StuffCategory], semantic_class: str, loose: bool) -> int:
+    """Id of the category of a class, or of `OTHER`."""
+    return stuff.get((semantic_class, loose), stuff[OTHER, False]).id
+
+
+def map_entities(static: StaticWorld) -> list[MapEntity]:
+    """A building's parts as relations know them; walls and floors are sheets, of no thickness otherwise."""
+    return [
+        MapEntity(
+            part.name,
+            part.semantic_class,
+            part.T_map_part,
+            np.maximum(part.extents, SHEET),
+            part.room,
+            part.supports,
+        )
+        for part in static.parts
+    ]

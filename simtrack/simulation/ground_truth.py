@@ -177,6 +177,11 @@ class GroundTruth:
         hits = self._rays.scene.cast(self._full, T_map_camera, min_distance=0.03)
         return self._rays.ids(hits).reshape(self._intrinsics.height, self._intrinsics.width)
 
+    def rays(self, stamp: int) -> WorldRays:
+        """The world as it was at a stamp, to cast rays at until the next question or step."""
+        self._load(stamp)
+        return self._rays
+
     def lidar_ids(self, stamp: int) -> Int32:
         """(N,), index into `names` of what each shot of the scan that began at `stamp` hit, -1 = nothing.
 
