@@ -12,7 +12,8 @@ HEADLINE = (
     "localization.located", "localization.residual.median", "localization.residual.p95",
     "localization.translation_error.median", "localization.rotation_error.median", "map.residual.median",
     "map.residual.p95", "depth.difference.median", "map.covered", "map.explained", "presegmentation.unknown",
-    "run.frames",
+    "objects.depth_difference.median", "tracking.recall", "tracking.translation_error.median",
+    "tracking.rotation_error.median", "run.frames",
 )  # fmt: skip
 """Metrics of a replay without a robot that are printed."""
 
@@ -44,9 +45,10 @@ def replay(
         rrd: Save the replay of an MCAP file for rerun in this file (needs the extra viz).
         threads: Threads of the compiled kernels; all cores if not given.
     """
-    from simtrack.recordings import is_mcap
+    from simtrack.recordings import find_source, is_mcap
 
     folder = out if out is not None else Path("runs") / f"{source.resolve().stem}-replay"
+    source = source if is_mcap(source) else find_source(source)
     if is_mcap(source):
         return _replay_stack(source, folder, overwrite, view, rrd, threads)
     from simtrack.cli import console

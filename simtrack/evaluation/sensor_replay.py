@@ -28,6 +28,7 @@ from simtrack.contracts import (
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.evaluation.closed_loop import Clock, Progress, StopSignal, peak_memory, set_threads
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
+from simtrack.evaluation.recorded_objects import ObjectStage
 from simtrack.evaluation.residuals import Residuals, map_residuals
 from simtrack.evaluation.run_config import versions
 from simtrack.evaluation.run_folder import RunFolder, SensorTables
@@ -97,6 +98,7 @@ class SensorReplay:
             origin = {"recording": str(self._log.path), "format": self._log.format}
             folder.write_config(origin | {"settings": _plain(asdict(self._config)), "versions": versions()})
             stages = _Stages(self._log, self._config, exits.enter_context(SensorTables(folder.path)))
+            exits.callback(stages.close)
             finished = False
             try:
                 for entry in self._log.read():
@@ -128,6 +130,12 @@ class _Stages:
         self._counts: Counter[str] = Counter()
         self._located, self._placed, self._along = Residuals(), Residuals(), Residuals()
         self._errors: list[tuple[float, float]] = []
+        self._objects = ObjectStage(log.models) if log.models else None
+
+    def close(self) -> None:
+        """Release memory outside of Python."""
+        if self._objects is not None:
+            self._objects.close()
 
     def take(self, entry: PosedFrame) -> None:
         """Take the next frame."""
@@ -146,6 +154,8 @@ class _Stages:
                 row = self._judge(found, shots, stated)
                 if stated is not None or found.status in _TRUSTED:
                     row |= self._compare(frame, shots, T if stated is None else stated)
+            if self._objects is not None and isinstance(frame, RgbdFrame):
+                self._objects.take(frame, T if stated is None else stated, entry.labels)
         self._tables.add(frame.stamp, self._status, T, row | {"map_faces": len(self._mesh.faces)})
 
     def _judge(self, found: Localization, shots: Measurement, stated: Float64 | None) -> dict[str, float]:
@@ -263,6 +273,8 @@ class _Stages:
         if camera:
             result["depth.difference.median"] = self._along.quantile(0.5)
             result["depth.difference.p95"] = self._along.quantile(0.95)
+        if self._objects is not None:
+            result |= self._objects.metrics()
         return result
 
 

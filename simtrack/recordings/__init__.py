@@ -8,20 +8,22 @@ answers what the recorded detector answered. Labels, if any, lie apart; `strip_l
 `simtrack.recordings.source` for the formats, which it tells apart by itself.
 """
 
-from simtrack.recordings.log import PosedFrame, RecordingWarning, SensorLog
+from simtrack.recordings.log import LabelledObject, PosedFrame, RecordingWarning, SensorLog
 from simtrack.recordings.reader import RecordedDetector, Recording, open_recording, strip_labels
 from simtrack.recordings.rgbd_folders import CameraOptions
-from simtrack.recordings.source import is_mcap, open_log
+from simtrack.recordings.source import find_source, is_mcap, open_log
 from simtrack.recordings.writer import McapWriter
 
 __all__ = [
     "CameraOptions",
+    "LabelledObject",
     "McapWriter",
     "PosedFrame",
     "RecordedDetector",
     "Recording",
     "RecordingWarning",
     "SensorLog",
+    "find_source",
     "is_mcap",
     "open_log",
     "open_recording",

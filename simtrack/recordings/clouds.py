@@ -31,7 +31,7 @@ def open_kitti(folder: Path) -> SensorLog:
 
     Beside the scans' folder may stand ``times.txt`` (seconds, one a line) or KITTI raw's ``timestamps.txt``, and
     ``poses.txt`` (12 numbers a line, T_world_camera of the left camera, with ``calib.txt`` naming ``Tr``; or, without
-    ``calib.txt``, those of the lidar itself).
+    ``calib.txt``, those of the lidar itself). Poses of the odometry benchmark are found in its ``poses/00.txt``, too.
     """
     scans = folder
     for name in ("velodyne", "velodyne_points/data", "data"):
@@ -75,13 +75,12 @@ def scan_of_points(
 
     What a cloud does not tell is told as far as it can be: rings number the points by half degrees of elevation.
     """
-    finite = np.isfinite(points).all(axis=1)
-    points = np.where(finite[:, None], points, 0.0)
-    ranges = np.linalg.norm(points, axis=1)
+    points = np.where(np.isfinite(points).all(axis=1, keepdims=True), points, 0.0)
+    ranges: Float64 = np.linalg.norm(points, axis=1)
     returned = np.asarray((ranges > 0.0) & (ranges <= MAX_RANGE))
     directions = np.zeros_like(points)
     directions[:, 0] = 1.0
-    directions[returned] = points[returned] / ranges[returned, None]
+    directions[returned] = points[returned] / ranges[returned][:, None]
     elevation = np.rad2deg(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
     return LidarScan(
         stamp=stamp,
@@ -147,8 +146,9 @@ def _wall_clock(words: list[str], path: Path, number: int) -> int:
 
 
 def _kitti_poses(folder: Path, count: int) -> list[Float64 | None]:
-    path = folder / "poses.txt"
-    if not path.is_file():
+    named = (folder / "poses.txt", folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt")
+    path = next((file for file in named if file.is_file()), None)
+    if path is None:
         return [None] * count
     poses = [
         rigid(numbers(words, 12, path, f"line {number}"), path, f"line {number}") for number, words in read_lines(path)

@@ -14,6 +14,18 @@ class RecordingWarning(UserWarning):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LabelledObject:
+    """An object that a recording's authors annotated."""
+
+    class_name: str
+    """Name of its model."""
+    T_camera_object: Float64
+    """(4, 4), object frame as in `ObjectModel`."""
+    visible_fraction: float
+    """0 to 1; 1 where the recording says nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PosedFrame:
     """A frame, and where its sensor was if the recording says so."""
 
@@ -21,8 +33,8 @@ class PosedFrame:
     """The sensor is its own base: T_base_camera or T_base_lidar is the identity."""
     T_map_sensor: Float64 | None = None
     """(4, 4), as stated by the recording, in its own fixed frame; None if it says nothing of this frame."""
-    objects: Mapping[str, Float64] = field(default_factory=dict)
-    """Labelled poses of the objects in it, T_map_object (4, 4) by instance, ``class-1``: not for estimators."""
+    labels: tuple[LabelledObject, ...] = ()
+    """Annotated objects whose models the recording has; not for estimators."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
