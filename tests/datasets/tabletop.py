@@ -1,6 +1,7 @@
 """A floor with simple things on it, to be labelled and rendered."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from simtrack.geometry.transforms import exp_so3, transform
 from simtrack.objects import box_keypoints
 from simtrack.raycast import RayScene, TriangleMesh
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 CAMERA = CameraIntrinsics(160, 120, 150.0, 150.0, 79.5, 59.5)
 FLOOR = Mesh(box_mesh((4.0, 4.0, 0.1)).vertices - [0.0, 0.0, 0.05], box_mesh((4.0, 4.0, 0.1)).faces)
 """Its upper side is z = 0."""
