@@ -6,7 +6,9 @@ import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Float64, Uint8
 from simtrack.datasets.content import Content, Light, Material, Shape
+from simtrack.datasets.corners import corners_of
 from simtrack.errors import InvalidValueError, RenderingError
+from simtrack.geometry.meshes import Mesh
 from simtrack.geometry.transforms import quaternion_from_rotation
 from simtrack.simulation.rendering import gl_context, gl_resources, in_view
 
@@ -182,27 +184,33 @@ def _add_shape(spec: "mujoco.MjSpec", looks: _Looks, number: int, shape: Shape) 
     """Add a mesh that is fixed in the world: scale and all go into its vertices."""
     import mujoco
 
-    mesh, T = shape.mesh, shape.T_map_mesh
+    T = shape.T_map_mesh
     scale = np.linalg.norm(T[:3, :3], axis=0)
+    mesh = Mesh(shape.mesh.vertices * scale, shape.mesh.faces)
+    if shape.uv is not None and shape.material.texture is not None:
+        look, uv = looks.textured(shape.material), shape.uv
+    else:
+        palette, which = _palette(shape.mesh)
+        look = looks.painted(shape.material, palette)
+        # Every face samples one texel, so that colours are exact and nothing is filtered.
+        u = ((which + 0.5) / len(palette)).astype(np.float32)
+        uv = np.full((len(mesh.faces), 3, 2), 0.5, np.float32)
+        uv[:, :, 0] = u[:, None]
+    # Left to itself, MuJoCo shades boxes as if they were round.
+    vertices, normals, texcoords, faces = corners_of(mesh, uv)
     asset = spec.add_mesh(name=f"shape{number}")
     asset.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open sheets have no volume
-    asset.uservert, asset.userface = (mesh.vertices * scale).ravel(), mesh.faces.ravel()
-    if shape.uv is not None and shape.material.texture is not None:
-        look = looks.textured(shape.material)
-        corners = shape.uv.reshape(-1, 2)
-        asset.usertexcoord = corners.ravel()
-        asset.userfacetexcoord = np.arange(len(corners), dtype=np.int32)
-    else:
-        # Every face samples one texel, so that colours are exact and nothing is filtered.
-        colors = np.full((1, 3), 200, np.uint8) if mesh.face_colors is None else mesh.face_colors
-        keys, which = np.unique(colors.astype(np.int32) @ np.array([65536, 256, 1]), return_inverse=True)
-        palette = np.stack([keys >> 16, keys >> 8 & 255, keys & 255], axis=1).astype(np.uint8)
-        look = looks.painted(shape.material, palette)
-        middles = (np.arange(len(palette)) + 0.5) / len(palette)
-        asset.usertexcoord = np.stack([middles, np.full(len(palette), 0.5)], axis=1).ravel()
-        texel = np.broadcast_to(which, len(mesh.faces))
-        asset.userfacetexcoord = np.repeat(texel, 3).astype(np.int32)
+    asset.uservert, asset.userface = vertices.ravel(), faces.ravel()
+    asset.usernormal, asset.usertexcoord = normals.ravel(), texcoords.ravel()
     spec.worldbody.add_geom(
         name=f"shape{number}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=asset.name, material=look, mass=0.0,
         contype=0, conaffinity=0, pos=T[:3, 3], quat=quaternion_from_rotation(T[:3, :3] / scale),
     )  # fmt: skip
+
+
+def _palette(mesh: Mesh) -> tuple[Uint8, np.ndarray]:
+    """(K, 3) colours of a mesh, and (F,) which of them a face has."""
+    if mesh.face_colors is None:
+        return np.full((1, 3), 200, np.uint8), np.zeros(len(mesh.faces), np.int64)
+    keys, which = np.unique(mesh.face_colors.astype(np.int32) @ np.array([65536, 256, 1]), return_inverse=True)
+    return np.stack([keys >> 16, keys >> 8 & 255, keys & 255], axis=1).astype(np.uint8), which

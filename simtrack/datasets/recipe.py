@@ -8,7 +8,7 @@ written as a pair ``[low, high]`` is drawn uniformly, anew for each scene or vie
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, get_args
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from simtrack.contracts import CameraIntrinsics
@@ -20,7 +20,7 @@ MAX_THINGS = 60
 """Targets or distractors in a scene."""
 PI = 3.141592653589793
 
-WriterName: TypeAlias = Literal["bop", "bop_webdataset", "coco", "yolo", "kitti", "tum", "mcap"]
+WriterName: TypeAlias = Literal["bop", "bop_webdataset", "coco", "yolo", "kitti", "tum", "dope", "mcap", "labels"]
 """Label and log formats."""
 TextureKind: TypeAlias = Literal["plain", "noise", "checker", "stripes", "dots", "wood", "marble", "bricks", "gradient"]
 """Procedural textures."""
@@ -198,7 +198,10 @@ class ShellViews(Strict):
 
 
 class DriveViews(Strict):
-    """The eye of a robot that drives through the scene, its own perception closing the loop."""
+    """The eye of a robot that drives through a scene as its file has it, its own perception closing the loop.
+
+    The depth camera is the recipe's, and no sensor's feed or calibration has faults; all else is the scene file's.
+    """
 
     kind: Literal["drive"]
     duration: float = Field(default=20.0, ge=1.0, le=3600.0)
@@ -276,7 +279,8 @@ class Recipe(Strict):
     views: Views = ShellViews(kind="shell")
     camera: CameraSettings = CameraSettings()
     effects: EffectSettings = EffectSettings()
-    writers: tuple[WriterName, ...] = Field(default=("bop",), min_length=1)
+    writers: dict[WriterName, dict[str, Any]] = Field(default={"bop": {}}, min_length=1)
+    """Format -> options of its writer; a list of formats takes their defaults."""
     _path: Path = PrivateAttr(default=Path("recipe.yaml"))
 
     @property
@@ -294,6 +298,12 @@ class Recipe(Strict):
 
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
 
+    @field_validator("writers", mode="before")
+    @classmethod
+    def _with_defaults(cls, value: Any) -> Any:
+        names = isinstance(value, list) and all(isinstance(name, str) for name in value)
+        return {name: {} for name in value} if names else value
+
     @model_validator(mode="after")
     def _coherent(self) -> "Recipe":
         def refuse(message: str) -> None:
@@ -302,8 +312,11 @@ class Recipe(Strict):
         if isinstance(self.views, DriveViews):
             if any(world.kind != "scene" for world in self.worlds):
                 refuse("views of kind 'drive' need worlds of kind 'scene'")
-            if self.targets.models or self.targets.folders or self.distractors.models:
-                refuse("views of kind 'drive' take targets and distractors from the scene file; leave them out")
+            shown = ("targets", "distractors", "placement", "lights", "materials", "textures", "effects")
+            if set(shown) & self.model_fields_set:
+                refuse("views of kind 'drive' show a scene file as it is; leave out " + ", ".join(shown))
+            if self.renderer != "mujoco":
+                refuse("views of kind 'drive' are rendered by 'mujoco'")
         else:
             if not (self.targets.models or self.targets.folders):
                 refuse("targets need at least one of 'models' and 'folders'")
@@ -351,7 +364,8 @@ def parse_recipe(document: Any, path: Path) -> Recipe:
 
 
 def _check_names(recipe: Recipe) -> None:
-    """Refuse presets and folders that do not exist, before anything is made."""
+    """Refuse presets, folders and writers' options that do not exist, before anything is made."""
+    from simtrack.datasets.writers import WRITERS as FACTORIES
     from simtrack.sensors.depth_noise import PRESETS
 
     if recipe.camera.depth not in PRESETS:
@@ -364,3 +378,8 @@ def _check_names(recipe: Recipe) -> None:
     for field, folder in folders.items():
         if not recipe.beside(folder).is_dir():
             raise FileFormatError(recipe.path, field, f"there is no folder {recipe.beside(folder)}")
+    for name, options in recipe.writers.items():
+        try:
+            validated(FACTORIES[name].options, options, recipe.path, f"writer {name}'s options")
+        except FileFormatError as error:
+            raise FileFormatError(recipe.path, f"writers.{name}.{error.field}".rstrip("."), error.reason) from error

@@ -66,6 +66,7 @@ class SettledScenes:
         assert isinstance(recipe.views, ShellViews)
         self._recipe, self._seed = recipe, seed
         self._things, self._wardrobe = Things(recipe), Wardrobe(recipe)
+        self.categories = self._things.categories
         self._scenes = [
             scene_of(recipe, k) if isinstance(world, SceneWorld) else None for k, world in enumerate(recipe.worlds)
         ]
@@ -75,7 +76,6 @@ class SettledScenes:
         self._shell = CameraShell(recipe.views, intrinsics)
         self._annotator = Annotator(intrinsics, FAR)
         self._renderer = _renderer(recipe)
-        self.categories = self._things.categories
         self.stuff = tuple(self._stuff.values())
 
     def scenes(self, count: int) -> int:
