@@ -111,8 +111,11 @@ class ProgressLine:
             f"{progress.seconds:.1f}{whole} s  {progress.frames_per_second:.1f} fps  "
             f"{objects}localization {progress.localization}"
         )
+        self.show(state, progress.seconds / progress.duration if progress.duration else 0.0)
+
+    def show(self, state: str, share: float) -> None:
+        """Show a state, and the share of the work that is done, 0 to 1."""
         if self._bar is not None and self._task is not None:
-            share = progress.seconds / progress.duration if progress.duration else 0.0
             self._bar.update(self._task, description=self._title, completed=share, state=state)
         elif time.monotonic() - self._said >= QUIET_PERIOD:
             self._said = time.monotonic()

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import simtrack
 from simtrack.cli import console
 from simtrack.cli.bench import bench
+from simtrack.cli.generate import generate
 from simtrack.cli.objects import objects
 from simtrack.cli.query import query
 from simtrack.cli.replay import replay
@@ -17,6 +18,7 @@ from simtrack.cli.trials import trials
 VERBS = {
     "run": run,
     "replay": replay,
+    "generate": generate,
     "scenes": scenes,
     "objects": objects,
     "query": query,

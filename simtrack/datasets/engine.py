@@ -10,7 +10,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -54,7 +53,8 @@ class Pool(Protocol):
         ...
 
 
-PoolFactory = Callable[[SourceFactory, Sequence[DatasetWriter]], Pool]
+PoolFactory = Callable[[SourceFactory, Sequence[DatasetWriter], Path], Pool]
+"""Makes the workers; the path is the existing folder that scenes are staged under."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,9 +138,9 @@ def generate(
                     writer.begin(out, info)
                 run = _Run(folder, lengths, done, report)
                 run.check_space(_known_size(done) or expected_bytes_per_frame(info, folder.formats))
-                make_pool = pool or partial(LocalPool, workers=1)
+                make_pool = pool or local_pool(1)
                 if len(done) < scenes:
-                    with closing(make_pool(factory, writers)) as workers:
+                    with closing(make_pool(factory, writers, folder.staging)) as workers:
                         run.go(workers)
                 say("writing what all scenes share")
                 for writer in writers:
@@ -154,7 +154,18 @@ def generate(
 
 def local_pool(workers: int) -> PoolFactory:
     """Worker processes on this machine."""
-    return partial(LocalPool, workers=workers)
+    return lambda factory, writers, staging: LocalPool(factory, writers, workers)
+
+
+def ray_pool(workers: int, address: str | None = None) -> PoolFactory:
+    """Workers on a Ray cluster, see `RayPool`."""
+
+    def make(factory: SourceFactory, writers: Sequence[DatasetWriter], staging: Path) -> Pool:
+        from simtrack.datasets.distributed import RayPool
+
+        return RayPool(factory, writers, workers, staging, address)
+
+    return make
 
 
 class _Run:

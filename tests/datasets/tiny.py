@@ -139,7 +139,7 @@ class PlainSceneWriter:
 class InlinePool:
     """Makes scenes in this process."""
 
-    def __init__(self, factory: SourceFactory, writers: Sequence[DatasetWriter]) -> None:
+    def __init__(self, factory: SourceFactory, writers: Sequence[DatasetWriter], staging: Path) -> None:
         self._maker = SceneMaker(factory, writers)
         self._events: list[Event] = []
 
