@@ -12,7 +12,7 @@ from simtrack.datasets.content import Placed
 from simtrack.datasets.frame import Category, DatasetInfo, LabelledFrame, LidarLabels, SceneInfo, StuffCategory
 from simtrack.datasets.writer import DatasetWriter
 from simtrack.geometry.kinematics import Joint, KinematicTree, Link
-from simtrack.geometry.meshes import Mesh, box_mesh, concatenate, cylinder_mesh, transformed
+from simtrack.geometry.meshes import Mesh, box_mesh, concatenate, cylinder_mesh, painted, transformed
 from simtrack.geometry.transforms import exp_so3, inverse, look_at, transform
 from simtrack.objects.model import ObjectModel, Symmetries, build_model, half_turns, rotational
 from simtrack.raycast import RayScene, TriangleMesh
@@ -44,7 +44,7 @@ WEDGE = Mesh(
 MODELS = (
     _model("bars", _bars(), half_turns("x", "z")),
     _model("can", cylinder_mesh(0.05, 0.16, 32, (220, 200, 60)), rotational("z")),
-    _model("wedge", WEDGE, Symmetries()),
+    _model("wedge", painted(WEDGE, (60, 180, 90)), Symmetries()),
 )
 POLE = cylinder_mesh(0.012, 0.5, 12, (90, 90, 90))
 FLOOR = box_mesh((4.0, 4.0, 0.1), (120, 120, 110))
@@ -71,6 +71,10 @@ class Small:
     info: DatasetInfo = INFO
     frames: int = FRAMES
     lidar: bool = True
+    noise: float = 0.002
+    """Metres, standard deviation of depth; where there is any, some readings are missing too."""
+    stretch: float = 1.0
+    """Factor on depth."""
 
     def scene_info(self, scene: int) -> SceneInfo:
         return SceneInfo(scene, self.frames, static_map=MAP, robot=ROBOT)
@@ -113,9 +117,9 @@ def _frame(
     T_map_camera = look_at(eye, np.array([0.35 if index == 1 else 0.0, 0.0, 0.05]))
     owners = Owners({0: 0} | {thing.ray_instance: thing.instance for thing in things})
     view = annotator.look(rays, owners, T_map_camera)
-    noise = rng.normal(0.0, 0.002, view.depth.shape)
-    depth = np.where((view.depth > 0) & (rng.random(view.depth.shape) > 0.05), view.depth + noise, 0.0)
-    depth = depth.astype(np.float32)
+    noise = source.noise * rng.normal(size=view.depth.shape)
+    read = (view.depth > 0) & (rng.random(view.depth.shape) > (0.05 if source.noise else 0.0))
+    depth = np.where(read, (view.depth + noise) * source.stretch, 0.0).astype(np.float32)
     shade = (40 + 30 * (view.ids + 1))[..., None] + rng.integers(0, 12, (*view.ids.shape, 3))
     T_map_base = transform(exp_so3(np.array([0.0, 0.0, 0.1 * index])), (0.1 * index, -1.0, 0.0))
     stamp = 1_000_000_001 + index * 33_333_333
