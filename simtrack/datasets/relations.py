@@ -8,15 +8,12 @@ import numpy as np
 from simtrack.contracts import Float64, MapEntity, Relation
 from simtrack.datasets.content import Placed
 from simtrack.geometry.meshes import Mesh
-from simtrack.perception.scene_graph import (
-    RELATIONS,
-    Body,
-    RelationConfig,
-    Shape,
-    map_entity_shape,
-    model_shape,
-    relation_margins,
-)
+from simtrack.perception.scene_graph import RELATIONS, RelationConfig, Shape, map_entity_shape, model_shape
+from simtrack.perception.scene_graph.bodies import BodyArrays
+from simtrack.perception.scene_graph.pairs import PairTable
+
+_KEPT = 2000
+"""Shapes that are kept beyond those in use: an office floor has some hundred pieces of furniture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +26,7 @@ class _Model:
 
 
 class Relations:
-    """True relations of settled scenes; shapes are made once for each mesh and scale."""
+    """True relations of scenes; shapes are made once for each mesh and scale, and kept while they are in use."""
 
     def __init__(self, config: RelationConfig | None = None) -> None:
         """`config`: the scene graph's thresholds, its defaults if None."""
@@ -52,26 +49,40 @@ class Relations:
         Returns:
             Relations ordered by subject, name and reference.
         """
-        bodies = [Body(self._shape(thing), np.asarray(thing.T_map_object, float)) for thing in things]
-        bodies += [Body(self._static(entity), np.asarray(entity.T_map_entity, float)) for entity in statics]
-        names = [thing.name for thing in things] + [entity.name for entity in statics]
+        arrays = BodyArrays({}, self._config, capacity=max(1, len(things) + len(statics)))
+        names: dict[int, str] = {}
+        used: set[tuple[int, bytes]] = set()
+        shapes = [self._shape(thing) for thing in things] + [self._static(entity) for entity in statics]
+        for key, shape in shapes:
+            if key not in used:
+                arrays.declare(str(key), shape)
+                used.add(key)
+        for (key, _), body in zip(shapes, (*things, *statics), strict=True):
+            T_map = body.T_map_object if isinstance(body, Placed) else body.T_map_entity
+            names[arrays.add(str(key), np.asarray(T_map, float))] = body.name
+        if len(self._shapes) > _KEPT:
+            self._shapes = {key: kept for key, kept in self._shapes.items() if key in used}
+        slots = np.array(list(names), np.int64)
+        apart = PairTable().update(
+            arrays.world, slots, slots[: len(things)], np.zeros(len(things)), self._config.parameters()
+        )
         found = {Relation(carried, "on", carrier) for carried, carrier in support}
-        if len(bodies) > 1:
-            margins = relation_margins(bodies, self._config)
-            for i, j, k in np.argwhere(margins >= 0.0).tolist():
-                if RELATIONS[k] != "on" and min(i, j) < len(things):
-                    found.add(Relation(names[i], RELATIONS[k], names[j]))
+        for subject, reference, _, held in apart.tolist():
+            for bit, relation in enumerate(RELATIONS):
+                if relation != "on" and held >> bit & 1:
+                    found.add(Relation(names[subject], relation, names[reference]))
         return tuple(sorted(found, key=lambda relation: (relation.subject, relation.name, relation.reference)))
 
-    def _shape(self, thing: Placed) -> Shape:
+    def _shape(self, thing: Placed) -> tuple[tuple[int, bytes], Shape]:
         key = id(thing.mesh), np.asarray(thing.scale, float).tobytes()
         if key not in self._shapes:
             mesh = Mesh(thing.mesh.vertices * thing.scale, thing.mesh.faces.astype(np.int32))
             self._shapes[key] = thing.mesh, model_shape(_Model(thing.semantic_class, thing.extents, mesh))
-        return self._shapes[key][1]
+        return key, self._shapes[key][1]
 
-    def _static(self, entity: MapEntity) -> Shape:
-        if (id(entity), b"") not in self._shapes:
+    def _static(self, entity: MapEntity) -> tuple[tuple[int, bytes], Shape]:
+        key = id(entity), b""
+        if key not in self._shapes:
             shape = map_entity_shape(entity, self._config.container_classes, self._config.layout_classes)
-            self._shapes[id(entity), b""] = entity, shape
-        return self._shapes[id(entity), b""][1]
+            self._shapes[key] = entity, shape
+        return key, self._shapes[key][1]

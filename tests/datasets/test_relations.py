@@ -6,9 +6,9 @@ import numpy as np
 from simtrack.contracts import MapEntity, Relation
 from simtrack.datasets.relations import Relations
 from simtrack.geometry.transforms import exp_so3, transform
-from simtrack.perception.scene_graph import RelationConfig
+from simtrack.perception.scene_graph import RELATIONS, Body, RelationConfig, relation_margins
 from simtrack.simulation.contacts import contact_pairs, support_tree
-from tests.datasets.tabletop import BOX, CAN, placed, standing
+from tests.datasets.tabletop import BOX, BRACKET, CAN, placed, standing
 
 TABLE = MapEntity("table", "table", transform(None, (0.0, 0.0, -0.4)), np.array([1.0, 1.0, 0.8]))
 
@@ -30,6 +30,27 @@ def test_relations_are_the_scene_graphs_and_on_is_what_physics_says() -> None:
     assert not {(a, name, a) for a, name, b in told(found) if a == b}
     assert found == tuple(sorted(found, key=lambda r: (r.subject, r.name, r.reference)))
     assert Relations().of(things[::-1], (TABLE,), support[::-1]) == found
+
+
+def test_they_are_the_scene_graphs_margins_that_are_not_negative() -> None:
+    rng, config = np.random.default_rng(5), RelationConfig()
+    for _ in range(10):
+        things = tuple(
+            placed(k, mesh, transform(exp_so3(rng.uniform(-2, 2, 3)), rng.uniform(-0.3, 0.3, 3)), scale=scale)
+            for k, (mesh, scale) in enumerate(((BOX, 1.0), (CAN, 1.0), (BOX, 1.4), (BRACKET, 0.7)), start=1)
+        )
+        statics = (TABLE, MapEntity("wall", "wall", transform(None, (0.5, 0.0, 0.0)), np.array([0.1, 3.0, 3.0])))
+        relations = Relations(config)
+        bodies = [Body(relations._shape(thing)[1], thing.T_map_object) for thing in things]
+        bodies += [Body(relations._static(entity)[1], entity.T_map_entity) for entity in statics]
+        names = [thing.name for thing in things] + [entity.name for entity in statics]
+        margins = relation_margins(bodies, config)
+        expected = {
+            (names[i], RELATIONS[k], names[j])
+            for i, j, k in np.argwhere(margins >= 0.0)
+            if RELATIONS[k] != "on" and min(i, j) < len(things)
+        }
+        assert told(relations.of(things, statics, ())) == expected and len(expected) > 5
 
 
 def test_nothing_is_said_of_furniture_alone_and_scale_counts() -> None:
