@@ -80,14 +80,20 @@ def inside(folder: Path, name: str, path: Path, where: str) -> Path:
 
 
 def read_depth(path: Path, scale: float, missing: int | None = None) -> np.ndarray:
+    """(H, W) float32 metres, 0 = no reading, of a 16-bit PNG file, see `decoded_depth`."""
+    return decoded_depth(read_bytes(path), path, scale, missing)
+
+
+def decoded_depth(data: bytes, path: Path, scale: float, missing: int | None = None) -> np.ndarray:
     """(H, W) float32 metres, 0 = no reading, of a 16-bit PNG.
 
     Args:
-        path: the image.
+        data: the image.
+        path: where it comes from, for messages.
         scale: metres that 1 stands for.
         missing: a value beside 0 that stands for no reading.
     """
-    image = _decoded(path)
+    image = decoded_image(data, path)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise FileFormatError(path, "", f"{image.dtype} image of shape {image.shape}; depth is a 16-bit grey PNG")
     depth = image.astype(np.float32) * np.float32(scale)
@@ -97,8 +103,13 @@ def read_depth(path: Path, scale: float, missing: int | None = None) -> np.ndarr
 
 
 def read_rgb(path: Path) -> np.ndarray:
+    """(H, W, 3) uint8 of a PNG or JPEG file, see `decoded_rgb`."""
+    return decoded_rgb(read_bytes(path), path)
+
+
+def decoded_rgb(data: bytes, path: Path) -> np.ndarray:
     """(H, W, 3) uint8 of a PNG or JPEG image; grey ones have three equal channels."""
-    image = _decoded(path)
+    image = decoded_image(data, path)
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)):
         raise FileFormatError(path, "", f"{image.dtype} image of shape {image.shape}; colour has 8 bits a channel")
     if image.ndim == 2:
@@ -106,11 +117,10 @@ def read_rgb(path: Path) -> np.ndarray:
     return np.ascontiguousarray(image[:, :, 2::-1])
 
 
-def _decoded(path: Path) -> np.ndarray:
+def decoded_image(data: bytes, path: Path) -> np.ndarray:
     """The image as OpenCV decodes it, BGR, once its header has claimed no more than `MAX_PIXELS`."""
     import cv2
 
-    data = read_bytes(path)
     size = image_size(data)
     if size is None:
         raise FileFormatError(path, "", "is neither a PNG nor a JPEG image, or its header is damaged")
