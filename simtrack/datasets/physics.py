@@ -19,13 +19,17 @@ from simtrack.geometry.transforms import (
 from simtrack.objects import ObjectModel
 from simtrack.simulation.building.parts import StaticWorld
 from simtrack.simulation.contacts import support_tree
-from simtrack.simulation.placement import RESTARTS, TRIES, Area, is_free, outline
+from simtrack.simulation.placement import Area, is_free, outline
 
 if TYPE_CHECKING:
     import mujoco
 
 TIMESTEP = 0.002
 """Seconds."""
+TRIES = 200
+"""Draws for the place of one thing."""
+RESTARTS = 5
+"""New beginnings with all things before an arrangement counts as impossible."""
 ROUNDS = 8
 """How often what fell off the support is dropped again."""
 FENCED = 0.8
