@@ -1,71 +1,45 @@
 """Feeds the stages that need no robot from the frames of one sensor: localization, pre-segmentation, depth residuals.
 
-Such recordings bring no map. The first frames make it: the surface that they saw, triangulated; later frames are
-localized in it, compared with it, and segmented into what it explains and what it does not. Where they look past it, it
-grows. Poses that the recording states place the frames of a camera; estimates start from the first one alone and are
-compared with the others.
+Such recordings bring no map. The first frame makes it: the surface that it saw, triangulated; later frames are
+localized in it, compared with it, and segmented into what it explains and what not. Where they look past it, it grows.
+Poses that the recording states are where its frames are compared with the map. Estimates start from the first of them
+alone, and anew where the sensor is said to have moved too far at once or where the localizer has lost it.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from simtrack.contracts import (
-    NANOSECONDS,
-    Bool,
-    Float64,
-    LidarScan,
-    Localization,
-    Presegmentation,
-    RgbdFrame,
-    StaticMap,
-    Status,
-)
-from simtrack.errors import FileFormatError, InvalidValueError
+from simtrack.contracts import NANOSECONDS, Float64, Localization, RgbdFrame, Status
+from simtrack.errors import FileFormatError
 from simtrack.evaluation.closed_loop import Clock, Progress, StopSignal, peak_memory, set_threads
+from simtrack.evaluation.growing_map import GrowingMap, GrowingMapConfig
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
 from simtrack.evaluation.recorded_objects import ObjectStage
 from simtrack.evaluation.residuals import Residuals, map_residuals
 from simtrack.evaluation.run_config import versions
 from simtrack.evaluation.run_folder import RunFolder, SensorTables
 from simtrack.evaluation.trajectory import absolute_errors
-from simtrack.geometry.meshes import Mesh, concatenate, transformed
-from simtrack.geometry.transforms import apply
-from simtrack.objects.export import write_ply
 from simtrack.perception.localization.free import FreeConfig, FreeLocalizer
 from simtrack.perception.localization.measurement import Measurement
-from simtrack.perception.localization.surface import MapSurface
-from simtrack.perception.mapping import ScanMeshConfig, mesh_of_depth, mesh_of_scan
-from simtrack.perception.tracking.presegmentation import PresegmentationConfig, presegment_camera, presegment_lidar
-from simtrack.raycast import RayBundle
 from simtrack.recordings import PosedFrame, SensorLog
 
-_TRUSTED = (Status.OK, Status.DEGRADED)
 INLIER = 0.05
 """Metres from the map's plane within which a reading counts as explained."""
+TRUSTED = (Status.OK, Status.DEGRADED)
+"""Statuses of poses that count as estimates."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorReplayConfig:
     """Settings of `SensorReplay`."""
 
-    mesh: ScanMeshConfig = field(default_factory=ScanMeshConfig)
+    map: GrowingMapConfig = field(default_factory=GrowingMapConfig)
     localizer: FreeConfig = field(default_factory=FreeConfig)
-    presegmentation: PresegmentationConfig = field(default_factory=PresegmentationConfig)
-    map_noise: float = 0.01
-    """Metres, standard deviation of a mesh of merged readings."""
-    grow_below: float = 0.7
-    """The map grows by what a frame sees beyond it if it covers a smaller share of the frame's readings."""
-    max_faces: int = 2_000_000
-    """The map grows no further."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.grow_below <= 1.0:
-            raise InvalidValueError("SensorReplayConfig.grow_below", self.grow_below, "0 to 1")
 
 
 class SensorReplay:
@@ -88,49 +62,61 @@ class SensorReplay:
         """Replay to the end, or until Ctrl-C or a kill; returns the metrics, and whether it was stopped.
 
         Raises:
-            FileFormatError: a frame cannot be read, or there are none; results of what came before it are kept.
+            FileFormatError: no frame can be used (nothing is written), or a later one cannot be read (the results of
+                those before it are kept).
             OutputExistsError: the folder exists and may not be overwritten.
         """
         set_threads(self._threads)
+        frames = iter(self._log.read())
+        first, grown = self._begin(frames)
         with ExitStack() as exits:
             stop = exits.enter_context(StopSignal())
             folder = RunFolder(self._out, self._overwrite)
             origin = {"recording": str(self._log.path), "format": self._log.format}
             folder.write_config(origin | {"settings": _plain(asdict(self._config)), "versions": versions()})
-            stages = _Stages(self._log, self._config, exits.enter_context(SensorTables(folder.path)))
+            tables = exits.enter_context(SensorTables(folder.path))
+            stages = _Stages(self._log, first, grown, self._config.localizer, tables)
             exits.callback(stages.close)
             finished = False
             try:
-                for entry in self._log.read():
-                    stages.take(entry)
-                    self._on_progress(stages.progress())
+                for entry in frames:
                     if stop.asked:
                         break
-                if not stages.frames:
-                    raise FileFormatError(self._log.path, "", f"holds no frame of a {self._log.format}")
+                    stages.take(entry)
+                    self._on_progress(stages.progress())
                 finished = not stop.asked
             finally:
                 metrics = stages.metrics() | {"run.partial": measured(not finished, "1")}
                 folder.write_metrics(metrics)
-                stages.save_map(folder.path / "map.ply")
+                grown.save(folder.path / "map.ply")
         return metrics, stop.asked
+
+    def _begin(self, frames: Iterable[PosedFrame]) -> tuple[PosedFrame, GrowingMap]:
+        """The first frame that sees a surface (from a stated pose, if the recording states any), and its map."""
+        grown, posed = GrowingMap(self._config.map), self._log.posed
+        for entry in frames:
+            if (entry.T_map_sensor is not None or not posed) and grown.add(entry.frame, _start(entry)):
+                return entry, grown
+        reason = f"no frame of this {self._log.format} sees a surface" + (" from a stated pose" if posed else "")
+        raise FileFormatError(self._log.path, "", reason + "; a map is made of one")
 
 
 class _Stages:
-    """The map that grows, and what later frames are found to be in it."""
+    """What later frames are found to be in the map of the first one."""
 
-    def __init__(self, log: SensorLog, config: SensorReplayConfig, tables: SensorTables) -> None:
-        self._log, self._config, self._tables = log, config, tables
-        self._clock = Clock()
-        self._mesh = Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
-        self._localizer: FreeLocalizer | None = None
-        self._stamps: tuple[int, int] | None = None
-        self._status = ""
-        self.frames = self._grown = 0
-        self._counts: Counter[str] = Counter()
+    def __init__(
+        self, log: SensorLog, first: PosedFrame, grown: GrowingMap, config: FreeConfig, tables: SensorTables
+    ) -> None:
+        self._camera, self._noise, self._map, self._tables = log.sensor == "camera", log.noise, grown, tables
+        self._first = self._last = first.frame.stamp
+        self._stated, self._status = first.T_map_sensor, "map"
+        self._localizer = FreeLocalizer(grown.surface, first.frame.stamp, _start(first), config)
+        self._clock, self._counts = Clock(), Counter[str](frames=1)
         self._located, self._placed, self._along = Residuals(), Residuals(), Residuals()
         self._errors: list[tuple[float, float]] = []
         self._objects = ObjectStage(log.models) if log.models else None
+        self._take_objects(first, _start(first))
+        tables.add(first.frame.stamp, "map", _start(first), {"map_faces": grown.faces})
 
     def close(self) -> None:
         """Release memory outside of Python."""
@@ -140,146 +126,117 @@ class _Stages:
     def take(self, entry: PosedFrame) -> None:
         """Take the next frame."""
         frame, stated = entry.frame, entry.T_map_sensor
-        self._stamps = (self._stamps or (frame.stamp, 0))[0], frame.stamp
-        self.frames += 1
+        self._last = frame.stamp
+        self._counts["frames"] += 1
         with self._clock("stack"):
-            if self._localizer is None:
-                T, self._status, row = np.eye(4) if stated is None else stated, "map", {}
-                self._grow(frame, T, None)
-                self._localizer = FreeLocalizer(self._surface(), frame.stamp, T, self._config.localizer)
+            shots = self._localizer.measure(frame, self._noise)
+            if self._has_jumped(stated):
+                assert stated is not None
+                self._localizer.restart(frame.stamp, stated)
+                T, self._status, row, placed = stated, "jump", {}, True
             else:
-                shots = self._localizer.measure(frame, self._log.noise)
                 found = self._localizer.update(shots)
-                T, self._status = found.T_map_base, found.status.value
+                T, self._status, placed = found.T_map_base, found.status.value, found.status in TRUSTED
                 row = self._judge(found, shots, stated)
-                if stated is not None or found.status in _TRUSTED:
-                    row |= self._compare(frame, shots, T if stated is None else stated)
-            if self._objects is not None and isinstance(frame, RgbdFrame):
-                self._objects.take(frame, T if stated is None else stated, entry.labels)
-        self._tables.add(frame.stamp, self._status, T, row | {"map_faces": len(self._mesh.faces)})
+                if stated is not None and found.status is Status.LOST:
+                    self._localizer.restart(frame.stamp, stated)
+            here = T if stated is None else stated
+            if stated is not None or placed:
+                row |= self._compare(entry, shots, here)
+                self._take_objects(entry, here)
+        self._stated = stated if stated is not None else self._stated
+        self._tables.add(frame.stamp, self._status, T, row | {"map_faces": self._map.faces})
+
+    def _has_jumped(self, stated: Float64 | None) -> bool:
+        """Whether the sensor is said to have moved further since the last stated pose than a localizer can follow."""
+        return stated is not None and self._stated is not None and not self._localizer.follows(self._stated, stated)
 
     def _judge(self, found: Localization, shots: Measurement, stated: Float64 | None) -> dict[str, float]:
         """The estimate beside the map, and beside the stated pose."""
-        assert self._localizer is not None
-        trusted = found.status in _TRUSTED
+        trusted = found.status in TRUSTED
         self._counts.update(located=trusted, tried=1)
         if not trusted:
             return {}
-        residuals = map_residuals(shots, found.T_map_base, self._localizer.surface.scene)
-        self._located.add(residuals.planes)
-        row = {"residual_median": _quantile(residuals.planes, 0.5), "residual_p95": _quantile(residuals.planes, 0.95)}
+        planes = map_residuals(shots, found.T_map_base, self._map.surface.scene).planes
+        self._located.add(planes)
+        row = {"residual_median": _quantile(planes, 0.5), "residual_p95": _quantile(planes, 0.95)}
         if stated is not None:
             translation, rotation = absolute_errors([found.T_map_base], [stated])
             self._errors.append((float(translation[0]), float(rotation[0])))
             row |= {"translation_error": float(translation[0]), "rotation_error": float(rotation[0])}
         return row
 
-    def _compare(self, frame: RgbdFrame | LidarScan, shots: Measurement, T: Float64) -> dict[str, float]:
+    def _compare(self, entry: PosedFrame, shots: Measurement, T: Float64) -> dict[str, float]:
         """What of a frame taken at the pose `T` the map covers and explains, and what is left; the map may grow."""
-        assert self._localizer is not None
-        residuals = map_residuals(shots, T, self._localizer.surface.scene)
-        covered = residuals.covered
+        residuals = map_residuals(shots, T, self._map.surface.scene)
+        count, covered = len(residuals.covered), int(np.count_nonzero(residuals.covered))
         explained = int(np.count_nonzero(residuals.planes <= INLIER))
         self._placed.add(residuals.planes)
         self._along.add(residuals.along)
-        segmented = self._presegment(frame, T)
+        segmented = self._map.presegment(entry.frame, T)
         self._counts.update(
-            readings=len(covered), covered=int(np.count_nonzero(covered)), explained=explained, valid=segmented.valid,
+            compared=1, readings=count, covered=covered, explained=explained, valid=segmented.valid,
             unknown=int(np.count_nonzero(segmented.unknown)), regions=len(segmented.regions),
         )  # fmt: skip
-        share = float(covered.mean()) if len(covered) else 1.0
-        if share < self._config.grow_below and len(self._mesh.faces) < self._config.max_faces:
-            self._grow(frame, T, self._uncovered(frame, T))
-            self._localizer.surface = self._surface()
+        if count:
+            self._map.grow(entry.frame, T, covered / count)
+            self._localizer.surface = self._map.surface
         return {
-            "readings": len(covered), "covered": share, "explained": explained / max(len(covered), 1),
+            "readings": count, "covered": covered / max(count, 1), "explained": explained / max(count, 1),
             "difference_median": _quantile(np.abs(residuals.along), 0.5), "unknown": 1.0 - segmented.reduction,
             "regions": len(segmented.regions),
         }  # fmt: skip
 
-    def _presegment(self, frame: RgbdFrame | LidarScan, T: Float64) -> Presegmentation:
-        assert self._localizer is not None
-        scene, config = self._localizer.surface.scene, self._config.presegmentation
-        if isinstance(frame, RgbdFrame):
-            return presegment_camera(frame, T, scene, config=config)
-        return presegment_lidar(frame, lambda stamp: T, scene, config=config)
-
-    # ------------------------------------------------------------------------------------------------------- the map
-
-    def _grow(self, frame: RgbdFrame | LidarScan, T: Float64, keep: Bool | None) -> None:
-        """Add the surface that a frame saw from the pose `T`, of all readings or of some."""
-        mesh = self._config.mesh
-        seen = mesh_of_depth(frame, mesh, keep) if isinstance(frame, RgbdFrame) else mesh_of_scan(frame, mesh, keep)
-        self._mesh = concatenate([self._mesh, transformed(seen, T)])
-        self._grown += 1
-        if not len(self._mesh.faces):
-            raise FileFormatError(
-                self._log.path, f"frame {self.frames - 1}", "sees no surface that a map could be made of"
-            )
-
-    def _uncovered(self, frame: RgbdFrame | LidarScan, T: Float64) -> Bool:
-        """(H, W) or (N,), True where a frame taken at the pose `T` looks past the map."""
-        assert self._localizer is not None
-        scene = self._localizer.surface.scene
-        if isinstance(frame, RgbdFrame):
-            hits = scene.cast(RayBundle.from_camera(frame.intrinsics), T)
-            return ~np.isfinite(hits.distances).reshape(frame.depth.shape)
-        returned = np.isfinite(frame.ranges)
-        points = np.where(returned, frame.ranges, 0.0)[:, None] * frame.directions
-        return returned & ~np.isfinite(scene.closest_points(apply(T, points), 5 * INLIER).distances)
-
-    def _surface(self) -> MapSurface:
-        vertices = self._mesh.vertices.astype(np.float32)
-        return MapSurface(StaticMap(vertices, self._mesh.faces, noise=self._config.map_noise))
-
-    def save_map(self, path: Path) -> None:
-        """Write the map as PLY, for looking at it."""
-        if len(self._mesh.faces):
-            write_ply(path, self._mesh)
+    def _take_objects(self, entry: PosedFrame, T: Float64) -> None:
+        if self._objects is not None and isinstance(entry.frame, RgbdFrame):
+            self._objects.take(entry.frame, T, entry.labels)
 
     # ------------------------------------------------------------------------------------------------------- results
 
     def progress(self) -> Progress:
         """How far it is."""
-        first, last = self._stamps or (0, 0)
-        seconds, rate = (last - first) / NANOSECONDS, self.frames / max(self._clock.total["stack"], 1e-9)
-        return Progress("replay", seconds, 0.0, rate, None, self._status)
+        seconds = (self._last - self._first) / NANOSECONDS
+        return Progress("replay", seconds, 0.0, self._rate().value or 0.0, None, self._status)
 
     def metrics(self) -> Metrics:
         """What was measured so far."""
-        counts, nothing = self._counts, "no frame after those that made the map"
+        counts, nothing = self._counts, "no frame after the one that made the map"
+        untried = "no frame near the one before it" if counts["compared"] else nothing
         translation, rotation = np.array(self._errors, dtype=float).reshape(-1, 2).T
-        unstated = "the recording states no poses of located frames"
-        camera = self._log.sensor == "camera"
+        unstated = "the recording states no pose of a located frame"
         result: Metrics = {
-            "localization.located": ratio(counts["located"], counts["tried"], nothing),
+            "localization.located": ratio(counts["located"], counts["tried"], untried),
             "localization.residual.median": self._located.quantile(0.5),
             "localization.residual.p95": self._located.quantile(0.95),
             "localization.translation_error.median": quantile(translation, 0.5, "m", unstated),
-            "localization.translation_error.max": quantile(translation, 1.0, "m", unstated),
+            "localization.translation_error.p95": quantile(translation, 0.95, "m", unstated),
             "localization.rotation_error.median": quantile(rotation, 0.5, "rad", unstated),
+            "localization.rotation_error.p95": quantile(rotation, 0.95, "rad", unstated),
             "map.residual.median": self._placed.quantile(0.5),
             "map.residual.p95": self._placed.quantile(0.95),
             "map.covered": ratio(counts["covered"], counts["readings"], nothing),
             "map.explained": ratio(counts["explained"], counts["readings"], nothing),
-            "map.faces": measured(len(self._mesh.faces), "1"),
-            "map.frames": measured(self._grown, "1"),
+            "map.faces": measured(self._map.faces, "1"),
+            "map.frames": measured(self._map.frames, "1"),
             "presegmentation.unknown": ratio(counts["unknown"], counts["valid"], nothing),
-            "presegmentation.regions": ratio(counts["regions"], counts["tried"], nothing),
-            "run.frames": measured(self.frames, "1"),
-            "speed.frames_per_second": _rate(self.frames, self._clock.total["stack"]),
+            "presegmentation.regions": ratio(counts["regions"], counts["compared"], nothing),
+            "run.frames": measured(counts["frames"], "1"),
+            "speed.frames_per_second": self._rate(),
             "speed.peak_memory": peak_memory(),
         }
-        if camera:
+        if self._camera:
             result["depth.difference.median"] = self._along.quantile(0.5)
             result["depth.difference.p95"] = self._along.quantile(0.95)
-        if self._objects is not None:
-            result |= self._objects.metrics()
-        return result
+        return result if self._objects is None else result | self._objects.metrics()
+
+    def _rate(self) -> Metric:
+        seconds = self._clock.total["stack"]
+        return measured((self._counts["frames"] - 1) / seconds, "Hz") if seconds else unmeasured("Hz", "one frame")
 
 
-def _rate(count: int, seconds: float) -> Metric:
-    return measured(count / seconds, "Hz") if seconds else unmeasured("Hz", "no frame was read")
+def _start(entry: PosedFrame) -> Float64:
+    """(4, 4) T_map_sensor of the first frame: the map's frame is the recording's, or else the sensor's own."""
+    return np.eye(4) if entry.T_map_sensor is None else entry.T_map_sensor
 
 
 def _quantile(values: Float64, share: float) -> float:

@@ -56,7 +56,8 @@ def open_bop(folder: Path, options: CameraOptions) -> SensorLog:
     used = {_object_id(entry, folder) for entries in poses.values() for entry in entries}
     models, centres = _models(folder.resolve().parent.parent, used)
     scene = _Scene(folder, cameras, poses, visibility, options, centres)
-    return SensorLog(folder, "BOP scene", "camera", len(cameras), lambda: _frames(scene), models)
+    posed = any("cam_R_w2c" in camera for camera in cameras.values())
+    return SensorLog(folder, "BOP scene", "camera", len(cameras), lambda: _frames(scene), models, posed)
 
 
 def _frames(scene: _Scene) -> Iterator[PosedFrame]:

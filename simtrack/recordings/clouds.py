@@ -40,8 +40,7 @@ def open_kitti(folder: Path) -> SensorLog:
     files = _files(scans, ".bin")
     around = [folder, scans.parent, scans.parent.parent]
     stamps, poses = _kitti_stamps(around, len(files)), _kitti_poses(folder, len(files))
-    read = _read_kitti, files, stamps, poses
-    return SensorLog(folder, "KITTI velodyne folder", "lidar", len(files), lambda: _scans(*read), noise=NOISE)
+    return _log(folder, "KITTI velodyne folder", _read_kitti, files, stamps, poses)
 
 
 def open_ply_scans(folder: Path) -> SensorLog:
@@ -64,8 +63,7 @@ def open_ply_scans(folder: Path) -> SensorLog:
         poses[files.index(by_name[match[2]])] = rigid(numbers(words, 16, stated, "transform"), stated, "transform")
         break
     stamps = [k * PERIOD for k in range(len(files))]
-    read = _read_ply, files, stamps, poses
-    return SensorLog(folder, "folder of PLY scans", "lidar", len(files), lambda: _scans(*read), noise=NOISE)
+    return _log(folder, "folder of PLY scans", _read_ply, files, stamps, poses)
 
 
 def scan_of_points(
@@ -91,6 +89,20 @@ def scan_of_points(
         intensities=np.nan_to_num(intensities).astype(np.float32),
         T_base_lidar=np.eye(4),
         sequence=sequence,
+    )
+
+
+def _log(
+    folder: Path,
+    kind: str,
+    reader: _Reader,
+    files: Sequence[Path],
+    stamps: Sequence[int],
+    poses: Sequence[Float64 | None],
+) -> SensorLog:
+    posed = any(pose is not None for pose in poses)
+    return SensorLog(
+        folder, kind, "lidar", len(files), lambda: _scans(reader, files, stamps, poses), posed=posed, noise=NOISE
     )
 
 

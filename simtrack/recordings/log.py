@@ -51,6 +51,8 @@ class SensorLog:
     """Frames in order, anew at each call. Raises `FileFormatError` for a frame that is damaged."""
     models: Mapping[str, ObjectModel] = field(default_factory=dict)
     """Object models that come with it, by name."""
+    posed: bool = False
+    """Whether poses are stated, of some frames at least."""
     noise: float = 0.0
     """Metres, standard deviation of a lidar range as the sensor's data sheet states it; 0 for a camera."""
 

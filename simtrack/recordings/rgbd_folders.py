@@ -75,7 +75,8 @@ class _Camera:
 def _log(folder: Path, kind: str, images: Sequence[_Image], camera: _Camera) -> SensorLog:
     if not images:
         raise FileFormatError(folder, "", f"holds no depth images of a {kind}")
-    return SensorLog(folder, kind, "camera", len(images), lambda: _frames(images, camera))
+    posed = any(image.T_map_camera is not None for image in images)
+    return SensorLog(folder, kind, "camera", len(images), lambda: _frames(images, camera), posed=posed)
 
 
 def _frames(images: Sequence[_Image], camera: _Camera) -> Iterator[PosedFrame]:

@@ -23,12 +23,18 @@ NOISE = 0.01
 """Metres: the data sheet's typical accuracy of 3 cm is that of three standard deviations."""
 _PRODUCTS = {0x21: "HDL-32E", 0x22: "VLP-16", 0x24: "Puck Hi-Res", 0x28: "VLP-32C", 0x31: "Velarray", 0x63: "VLS-128"}
 _DUAL, _RETURNS = 0x39, (0x37, 0x38, 0x39)
-_HEIGHTS = (11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2)
+BEAM_HEIGHTS = (11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2)
 """Millimetres, by laser id: where its beam leaves the sensor, above the centre (manual, table 9-1)."""
 _HOUR = 3_600_000_000
 """Microseconds: packets count from the top of the hour."""
 _BLOCK = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("returns", [("range", "<u2"), ("intensity", "u1")], 32)])
 _PACKET = np.dtype([("blocks", _BLOCK, 12), ("time", "<u4"), ("mode", "u1"), ("product", "u1")])
+MAX_FIRINGS = 10_000
+"""Of one turn; the slowest setting, five turns a second, has 3617."""
+_RINGS = np.argsort(np.argsort(VLP16_ELEVATIONS)).astype(np.uint8)
+"""Rank of each laser by elevation."""
+JITTER = 0.01
+"""Radians."""
 _LOWEST_SHARE = 0.5
 """Share of a turn that the end of a recording must hold to count as one."""
 
@@ -59,8 +65,9 @@ def _turns(path: Path) -> Iterator[PosedFrame]:
     for firings in _firings(path):
         azimuth = firings.azimuths[:, 0]
         previous = azimuth[0] if last is None else last
-        steps = np.mod(np.diff(azimuth, prepend=previous) + np.pi, 2 * np.pi) - np.pi
-        angles = swept + np.cumsum(np.maximum(steps, 0.0))
+        # Forwards, by nearly a turn where packets were lost; backwards only by what an encoder may jitter.
+        steps = np.mod(np.diff(azimuth, prepend=previous) + JITTER, 2 * np.pi) - JITTER
+        angles = np.maximum.accumulate(swept + np.cumsum(steps))
         swept, last = float(angles[-1]), float(azimuth[-1])
         if swept >= 2 * np.pi:
             cut = int(np.searchsorted(angles, 2 * np.pi))
@@ -70,6 +77,8 @@ def _turns(path: Path) -> Iterator[PosedFrame]:
             swept -= float(angles[cut])
         else:
             pending.append(firings)
+        if sum(len(part.stamps) for part in pending) > MAX_FIRINGS:
+            raise FileFormatError(path, f"turn {sequence}", f"{MAX_FIRINGS} firings within less than 360 degrees")
     if not pending:
         raise FileFormatError(path, "", "holds no data packets of a VLP-16 (UDP datagrams of 1206 bytes)")
     if swept >= _LOWEST_SHARE * 2 * np.pi:
@@ -90,7 +99,7 @@ def _scan(parts: list[_Firings], sequence: int) -> LidarScan:
     # The beam leaves the sensor a little above or below its centre: shots are those from the centre to what it met.
     flat = ranges * np.cos(elevations)
     points = np.stack([flat * np.cos(azimuths), -flat * np.sin(azimuths), ranges * np.sin(elevations)], axis=1)
-    points[:, 2] += np.tile(_HEIGHTS, count) / 1000.0
+    points[:, 2] += np.tile(BEAM_HEIGHTS, count) / 1000.0
     aimed = np.stack(
         [np.cos(elevations) * np.cos(azimuths), -np.cos(elevations) * np.sin(azimuths), np.sin(elevations)], axis=1
     )
@@ -108,9 +117,6 @@ def _scan(parts: list[_Firings], sequence: int) -> LidarScan:
         T_base_lidar=np.eye(4),
         sequence=sequence,
     )
-
-
-_RINGS = np.argsort(np.argsort(VLP16_ELEVATIONS)).astype(np.uint8)
 
 
 def _firings(path: Path) -> Iterator[_Firings]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from simtrack.contracts import Float64, LidarScan, Localization, Odometry, RgbdFrame, Status
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import interpolate, inverse
+from simtrack.geometry.transforms import difference, interpolate, inverse
 from simtrack.perception.localization.assessment import UNJUDGED
 from simtrack.perception.localization.config import MotionConfig, RegistrationConfig
 from simtrack.perception.localization.measurement import Measurement, depth_measurement, deskew, scan_end
@@ -82,8 +82,18 @@ class FreeLocalizer:
         self.surface = surface
         """May be replaced by a larger one in the same frame."""
         self.config = config or FreeConfig()
+        self.restart(stamp, T_map_base)
+
+    def restart(self, stamp: int, T_map_base: Float64) -> None:
+        """Forget what was measured; start anew at a known pose."""
         self._poses: list[tuple[int, Float64]] = [(stamp, np.array(T_map_base, dtype=float))]
         self._level = 0.0
+
+    def follows(self, T_before: Float64, T_after: Float64) -> bool:
+        """Whether a motion lies within the three standard deviations beyond which none is believed."""
+        motion = difference(T_after, T_before)
+        far, turned = float(np.linalg.norm(motion[:3])), float(np.linalg.norm(motion[3:]))
+        return far <= 3.0 * self.config.sigma and turned <= 3.0 * self.config.sigma_angle
 
     def measure(self, frame: LidarScan | RgbdFrame, sigma: float) -> Measurement:
         """The readings of a frame in the frame of the base, those of a lidar moved to the scan's end as predicted.
@@ -122,7 +132,7 @@ class FreeLocalizer:
             again = register(shots, self.surface, T, P, c.fine, T_start=coarse.T_map_base, assessed=True)
             found = again if found is None or _explained(again) > _explained(found) else found
         share = _explained(found)
-        if share < c.min_share or not found.converged:
+        if share < c.min_share or not found.converged or not self.follows(T, found.T_map_base):
             return Localization(stamp, T, P, Status.LOST, share, found.residual)
         self._level = share
         self._poses = [self._poses[-1], (stamp, found.T_map_base)]
