@@ -243,6 +243,8 @@ class EffectSettings(Strict):
     """Samples a side of a pixel at edges; 1 = off."""
     exposure: tuple[Annotated[float, Field(ge=-3, le=3)], Annotated[float, Field(ge=-3, le=3)]] = (0.0, 0.0)
     """Stops."""
+    white_balance: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
+    """Half width of a uniform relative error of the gains of red and of blue."""
     motion_blur: tuple[Annotated[float, Field(ge=0, le=50)], Annotated[float, Field(ge=0, le=50)]] = (0.0, 0.0)
     """Pixels that the image moves while the shutter is open."""
     bayer_noise: bool = False
