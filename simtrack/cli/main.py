@@ -14,11 +14,13 @@ from simtrack.cli.replay import replay
 from simtrack.cli.run import run
 from simtrack.cli.scenes import scenes
 from simtrack.cli.trials import trials
+from simtrack.cli.validate import validate
 
 VERBS = {
     "run": run,
     "replay": replay,
     "generate": generate,
+    "validate": validate,
     "scenes": scenes,
     "objects": objects,
     "query": query,
