@@ -103,7 +103,7 @@ def _things(rng: np.random.Generator) -> list[Placed]:
             Placed(number, number, f"{model.name}-{number}", model.semantic_class, which + 1, surface, T,
                    np.ones(3), model.extents, model.keypoints)
         )  # fmt: skip
-    T, surface = transform(None, (0.04, -0.12, 0.25)), TriangleMesh(POLE.vertices, POLE.faces)
+    T, surface = transform(None, (-0.17, -0.12, 0.25)), TriangleMesh(POLE.vertices, POLE.faces)
     none = np.empty((0, 3))
     return [*things, Placed(6, 6, "pole-6", "pole", None, surface, T, np.ones(3), POLE.extents, none)]
 

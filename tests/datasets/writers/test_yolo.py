@@ -95,7 +95,7 @@ def test_segments_filled_as_ultralytics_fills_them_are_the_masks(folder: Path) -
                 points = (np.reshape(row[1:], (-1, 2)) * SIZE).astype(np.int32)
                 again = np.zeros(mask.shape, np.uint8)
                 cv2.fillPoly(again, [points], 1)  # type: ignore[call-overload]
-                assert again[mask].all() and again[~mask].sum() <= 0.1 * mask.sum()
+                assert again[mask].all() and again[~mask].sum() <= 0.2 * mask.sum()  # bridges
                 parts += cv2.connectedComponents(mask.astype(np.uint8))[0] > 2
                 holes += cv2.connectedComponents(np.pad(~mask, 1, constant_values=True).astype(np.uint8))[0] > 2
     assert parts and holes
