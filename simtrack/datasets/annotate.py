@@ -138,8 +138,11 @@ class Annotator:
         for thing, (keypoints, visibility) in zip(things, points, strict=True):
             seen = tuple(boxes[thing.instance].tolist())
             mask = np.zeros(shape, np.bool_)
-            surface = thing.mesh.vertices, thing.mesh.faces, T_camera_map @ thing.T_map_mesh
-            total, valid, box = kernels.silhouette(*surface, self._camera, NEAR, seen, ids, thing.instance, depth, mask)
+            surface = thing.mesh.vertices, thing.mesh.faces, thing.mesh.topology.closed
+            pose = T_camera_map @ thing.T_map_mesh
+            total, valid, box = kernels.silhouette(
+                *surface, pose, self._camera, NEAR, seen, ids, thing.instance, depth, mask
+            )
             labels.append(
                 InstanceLabel(
                     instance=thing.instance,

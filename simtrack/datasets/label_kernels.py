@@ -54,8 +54,10 @@ def visible_parts(ids, count):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def silhouette(vertices, faces, T_camera_mesh, camera, near, seen_box, ids, own, depth, mask):
+def silhouette(vertices, faces, closed, T_camera_mesh, camera, near, seen_box, ids, own, depth, mask):
     """Every pixel whose centre lies in the projection of a face: what rays meet of a mesh that stands alone.
+
+    Of a closed mesh the faces on one side are enough: what looks in through one of them looks out through another.
 
     Pixels that show the instance `own` in `ids` (H, W), which lie in `seen_box` (u0, v0, u1, v1), belong to it whatever
     rounding says. The part inside the image is written into `mask` (H, W), which is False everywhere.
@@ -72,7 +74,7 @@ def silhouette(vertices, faces, T_camera_mesh, camera, near, seen_box, ids, own,
         u0, v0, u1, v1 = min(u0, seen_box[0]), min(v0, seen_box[1]), max(u1, seen_box[2]), max(v1, seen_box[3])
     canvas = np.zeros((max(v1 - v0 + 1, 0), max(u1 - u0 + 1, 0)), np.bool_)
     if canvas.size:
-        _cover(points, faces, camera, near, crosses, u0, v0, canvas)
+        _cover(points, faces, camera, near, crosses, closed and not crosses, u0, v0, canvas)
     total, valid, left, right, top, bottom = 0, 0, u1 + 1, u0 - 1, v1 + 1, v0 - 1
     for v in range(v0, v0 + canvas.shape[0]):
         inside = 0 <= v < height
@@ -143,7 +145,7 @@ def _clip(points, face, camera, near, corner):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cover(points, faces, camera, near, crosses, u0, v0, canvas):
+def _cover(points, faces, camera, near, crosses, one_side, u0, v0, canvas):
     """Set the pixels of the canvas, whose first one is (u0, v0), that the faces cover."""
     corner = np.empty((4, 2))
     for f in range(faces.shape[0]):
@@ -155,6 +157,10 @@ def _cover(points, faces, camera, near, crosses, u0, v0, canvas):
                 )  # fmt: skip
             continue
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        if one_side:
+            ax, ay, bx, by = points[i, 0], points[i, 1], points[j, 0], points[j, 1]
+            if (bx - ax) * (points[k, 1] - ay) - (by - ay) * (points[k, 0] - ax) < 0.0:
+                continue
         _cover_triangle(
             points[i, 0] - u0, points[i, 1] - v0, points[j, 0] - u0, points[j, 1] - v0,
             points[k, 0] - u0, points[k, 1] - v0, canvas,
