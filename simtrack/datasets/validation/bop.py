@@ -206,17 +206,16 @@ def _check_info(report: Report, path: Path, place: str, info: GtInfo, image: Bop
 
 
 def _check_amodal_box(report: Report, path: Path, place: str, amodal: Box, whole: Bool) -> None:
-    """What of the box lies inside the image has to hold the mask, and to touch it unless it leads out."""
-    found = box(whole)
-    if found is None:
-        return
+    """The box of the silhouette: that of its mask, or one that holds it and leads out of the image."""
+    inside = bop_box(box(whole))
     height, width = whole.shape
-    u0, v0 = amodal[0], amodal[1]
-    clipped = (max(u0, 0), max(v0, 0), min(u0 + amodal[2], width - 1), min(v0 + amodal[3], height - 1))
-    lead_out = (u0 < 0, v0 < 0, u0 + amodal[2] >= width, v0 + amodal[3] >= height)
-    inner = (clipped[0] <= found[0], clipped[1] <= found[1], clipped[2] >= found[2], clipped[3] >= found[3])
-    same = [a == b or out for a, b, out in zip(clipped, found, [any(lead_out)] * 4, strict=True)]
-    report.holds(all(inner) and all(same), path, place, list(amodal), f"a box around {list(bop_box(found))} of mask")
+    last = (amodal[0] + amodal[2], amodal[1] + amodal[3])
+    if amodal[0] >= 0 and amodal[1] >= 0 and last[0] < width and last[1] < height:
+        report.equal(path, place, amodal, inside)
+    elif inside != NOTHING:
+        holds = amodal[0] <= inside[0] and amodal[1] <= inside[1]
+        holds &= last[0] >= inside[0] + inside[2] and last[1] >= inside[1] + inside[3]
+        report.holds(holds, path, place, list(amodal), f"a box around {list(inside)}, that of mask")
 
 
 def bop_box(found: tuple[int, int, int, int] | None) -> Box:

@@ -27,7 +27,7 @@ class _Category(Entry):
     id: Annotated[int, Field(ge=1)]
     name: str
     keypoints: list[str] | None = None
-    skeleton: list[tuple[int, int]] = []
+    skeleton: tuple[tuple[int, int], ...] = ()
     isthing: Literal[0, 1] | None = None
 
 

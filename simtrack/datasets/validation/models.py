@@ -34,8 +34,8 @@ class ModelInfo(Entry):
     size_y: float
     size_z: float
     diameter: Annotated[float, Field(gt=0.0)]
-    symmetries_discrete: list[Annotated[list[float], Field(min_length=16, max_length=16)]] = []
-    symmetries_continuous: list[ContinuousSymmetry] = []
+    symmetries_discrete: tuple[Annotated[list[float], Field(min_length=16, max_length=16)], ...] = ()
+    symmetries_continuous: tuple[ContinuousSymmetry, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -130,7 +130,7 @@ def _check_points(report: Report, path: Path, field: str, found: Any, expected: 
                      f"points {off:.3g} px off", "the box's corners and centre, projected")  # fmt: skip
 
 
-# ------------------------------------------------------------------------------------------------------------------ DOPE
+# ----------------------------------------------------------------------------------------------------------------- DOPE
 
 
 class _DopeCamera(Entry):

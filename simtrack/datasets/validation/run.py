@@ -36,7 +36,7 @@ class Validation:
     instances: int
     """In them."""
     depth_error: tuple[float, float] | None
-    """Metres by which depth lies off the models: median of the absolute value, and 99th percentile; None without any."""
+    """Metres by which depth lies off the models: median of the amount, and its 99th percentile; None without any."""
     colour_offset: tuple[int, int] | None
     """(u, v) pixels by which colour edges lie off the masks'; None where no image was shown again."""
 

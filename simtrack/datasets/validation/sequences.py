@@ -89,7 +89,7 @@ def _rows(report: Report, path: Path, columns: int, rows: int) -> Float64:
     return np.zeros((0, columns)) if values is None else values
 
 
-# -------------------------------------------------------------------------------------------------------------- TUM RGB-D
+# ------------------------------------------------------------------------------------------------------------ TUM RGB-D
 
 
 def tum_folders(root: Path) -> list[Path]:
