@@ -59,7 +59,7 @@ def generate(
         try:
             summary = engines.generate(
                 partial(Generator, loaded, seed),
-                [make_writer(name, path=loaded.path) for name in loaded.writers],
+                [make_writer(name, options, loaded.path) for name, options in loaded.writers.items()],
                 folder,
                 count or loaded.counts.frames,
                 engines.local_pool(size) if engine == "local" else engines.ray_pool(size, address),
