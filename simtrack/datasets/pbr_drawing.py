@@ -47,6 +47,7 @@ class _Renderer(Renderer):
     def __init__(self, width: int, height: int, samples: int) -> None:
         super().__init__(width, height)
         self._samples = 0 if samples == 1 else min(samples, int(gl.glGetIntegerv(gl.GL_MAX_SAMPLES)))
+        self.want_depth = False
 
     def _configure_main_framebuffer(self) -> None:
         former = self._main_fb
@@ -56,6 +57,18 @@ class _Renderer(Renderer):
                 gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
                 size = self.viewport_width, self.viewport_height
                 gl.glRenderbufferStorageMultisample(gl.GL_RENDERBUFFER, self._samples, kind, *size)
+
+    def _read_main_framebuffer(self, scene: Any, flags: int) -> Any:
+        if self.want_depth:
+            return super()._read_main_framebuffer(scene, flags)
+        width, height = int(self.viewport_width), int(self.viewport_height)
+        rectangle = 0, 0, width, height
+        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._main_fb_ms)
+        gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, self._main_fb)
+        gl.glBlitFramebuffer(*rectangle, *rectangle, gl.GL_COLOR_BUFFER_BIT, gl.GL_NEAREST)
+        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._main_fb)
+        pixels: Any = gl.glReadPixels(*rectangle, gl.GL_RGB, gl.GL_UNSIGNED_BYTE)
+        return np.frombuffer(pixels, np.uint8).reshape(height, width, 3)[::-1], np.empty((0, 0), np.float32)
 
     def _compute_max_n_lights(self, flags: int) -> list[int]:
         return [MAX_LIGHTS] * 3  # pyrender asks OpenGL anew for each shape
@@ -85,9 +98,10 @@ class Drawing:
             self._scene.add(lamp, name=f"{number:06d}", pose=pose)
         self._eye = self._scene.add(self._lens)
 
-    def draw(self, T_map_camera: Float64) -> tuple[Uint8, Float32]:
-        """Colours (H, W, 3) and depth (H, W) in metres, 0 = nothing."""
+    def draw(self, T_map_camera: Float64, depth: bool) -> tuple[Uint8, Float32]:
+        """Colours (H, W, 3) and, if it is asked for, depth (H, W) in metres, 0 = nothing."""
         self._scene.set_pose(self._eye, T_map_camera @ _OPTICAL_OPENGL)
+        self._renderer.want_depth = depth
         images: Any = self._renderer.render(self._scene, RenderFlags.OFFSCREEN)
         return images
 

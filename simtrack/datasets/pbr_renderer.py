@@ -49,21 +49,21 @@ class PbrRenderer:
 
     def render(self, T_map_camera: Float64) -> Uint8:
         """See `ColorRenderer`. Raises RenderingError before the first scene and after the end."""
-        return self._draw(T_map_camera)[0]
+        return self._draw(T_map_camera, depth=False)[0]
 
     def depth(self, T_map_camera: Float64) -> Float32:
         """(H, W), metres along the optical axis, 0 = nothing: the rasteriser's own, to check it against rays.
 
         It is that of pixel centres if there is one sample a pixel.
         """
-        return self._draw(T_map_camera)[1]
+        return self._draw(T_map_camera, depth=True)[1]
 
-    def _draw(self, T_map_camera: Float64) -> tuple[Uint8, Float32]:
+    def _draw(self, T_map_camera: Float64, depth: bool) -> tuple[Uint8, Float32]:
         if self._gl is None or self._drawing is None:
             raise RenderingError("the renderer has no scene: call begin() first, and not after close()")
         self._gl.make_current()
-        color, depth = self._drawing.draw(np.asarray(T_map_camera, float))
-        return np.ascontiguousarray(color), np.ascontiguousarray(depth)
+        color, metres = self._drawing.draw(np.asarray(T_map_camera, float), depth)
+        return np.ascontiguousarray(color), np.ascontiguousarray(metres)
 
     def close(self) -> None:
         """See `ColorRenderer`."""
