@@ -43,6 +43,8 @@ IMPORT_NAMES = {
     "pyyaml": "yaml",
     "rerun-sdk": "rerun",
     "mcap-ros2-support": "mcap_ros2",
+    "pyrender-maintained": "pyrender",
+    "pyopengl": "OpenGL",
 }
 """Packages that are imported by another name."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
