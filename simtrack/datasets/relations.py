@@ -12,8 +12,8 @@ from simtrack.perception.scene_graph import RELATIONS, RelationConfig, Shape, ma
 from simtrack.perception.scene_graph.bodies import BodyArrays
 from simtrack.perception.scene_graph.pairs import PairTable
 
-_KEPT = 2000
-"""Shapes that are kept beyond those in use: an office floor has some hundred pieces of furniture."""
+_KEPT = 100
+"""Shapes up to which those out of use are kept too: scenes share models, but not random shapes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
