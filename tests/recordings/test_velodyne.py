@@ -51,7 +51,7 @@ def test_turns_come_back(packets: list[bytes], tmp_path: Path, order: str, nanos
         assert scan.times.min() == 0.0 and scan.times.max() == pytest.approx(0.1, abs=1e-4)
         # A shot ends where a ray from the sensor's centre in its direction meets the room.
         origins = np.tile(LIDAR_START[:3, 3].astype(np.float32), (len(scan.ranges), 1))
-        expected = world.scene.cast_rays(origins, scan.directions).distances
+        expected = world.scene.cast_rays(origins, scan.directions @ LIDAR_START[:3, :3].T.astype(np.float32)).distances
         difference = np.abs(expected - scan.ranges)
         assert np.median(difference) < 0.001 and np.quantile(difference, 0.99) < 0.02
         np.testing.assert_array_equal(scan.rings[:16], VLP16.shots(columns=1).rings)

@@ -4,7 +4,7 @@
 did; where that prediction does not explain a measurement, it is registered once more from coarse to fine.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,29 +18,21 @@ from simtrack.perception.localization.motion import OdometryTrack
 from simtrack.perception.localization.registration import Registration, register
 from simtrack.perception.localization.surface import MapSurface
 
-_ANYWHERE = 1e3
-"""Metres and radians: a standard deviation that says nothing of floor and tilt."""
+FREE = RegistrationConfig(floor_sigma=1e3, tilt_sigma=1e3, normal_sigma=0.05)
+"""Floor and tilt say nothing. Normals of a mesh that was made of one view err by some degrees: less would feign
+knowledge of directions along the walls of a room whose floor is not seen."""
+COARSE = replace(FREE, strides=(5,) * 40 + (2,), settled=1e-4, min_gate=0.3, min_kernel=0.05)
+"""Wide gates, and as many casts as half a metre takes."""
 
 
 @dataclass(frozen=True, slots=True)
 class FreeConfig:
     """Settings of `FreeLocalizer`."""
 
-    fine: RegistrationConfig = field(
-        default_factory=lambda: RegistrationConfig(floor_sigma=_ANYWHERE, tilt_sigma=_ANYWHERE)
-    )
+    fine: RegistrationConfig = FREE
     """The registration that decides."""
-    coarse: RegistrationConfig = field(
-        default_factory=lambda: RegistrationConfig(
-            strides=(5,) * 40 + (2,),
-            settled=1e-4,
-            min_gate=0.3,
-            min_kernel=0.05,
-            floor_sigma=_ANYWHERE,
-            tilt_sigma=_ANYWHERE,
-        )
-    )
-    """What comes before it where the prediction does not hold: wide gates, many casts."""
+    coarse: RegistrationConfig = COARSE
+    """What comes before it where the prediction does not hold."""
     sigma: float = 0.5
     """Metres, standard deviation of a prediction of the motion between two measurements."""
     sigma_angle: float = 0.1

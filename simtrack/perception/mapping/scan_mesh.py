@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from simtrack.contracts import Bool, Float64, Int32, LidarScan, RgbdFrame
 from simtrack.errors import InvalidValueError
@@ -23,6 +24,8 @@ class ScanMeshConfig:
     """Radians: lidar shots within it of each other, at about the same elevation, become one vertex."""
     elevation_cell: float = 0.0058
     """Radians, likewise; below the distance between two rings."""
+    max_gap: float = 0.06
+    """Radians, opening (half) of the widest cone between lidar shots that counts as seen."""
     block: int = 4
     """Pixels: so many rows and columns of a depth image become one vertex."""
     min_grazing: float = 0.17
@@ -37,7 +40,7 @@ class ScanMeshConfig:
     """... nor farther ones of a depth camera, which grow too coarse."""
 
     def __post_init__(self) -> None:
-        for name in ("azimuth_cell", "elevation_cell", "max_edge", "max_range", "max_depth"):
+        for name in ("azimuth_cell", "elevation_cell", "max_gap", "max_edge", "max_range", "max_depth"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"ScanMeshConfig.{name}", getattr(self, name), "a finite number > 0")
         if self.block < 1:
@@ -67,9 +70,12 @@ def mesh_of_scan(scan: LidarScan, config: ScanMeshConfig | None = None, keep: Bo
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        faces = ConvexHull(directions).simplices
+        hull = ConvexHull(directions)
     except QhullError:  # all directions in one plane: a single ring sees no surface
-        faces = np.empty((0, 3), np.int32)
+        return Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32))
+    # The plane of a facet cuts an empty cone out of the sphere: large where nothing was measured between its corners,
+    # as above the uppermost ring, whose neighbours would make triangles with each other.
+    faces = hull.simplices[-hull.equations[:, 3] >= np.cos(config.max_gap)]
     return _seen(directions * ranges[:, None], faces, config)
 
 
@@ -114,18 +120,35 @@ def _merged(scan: LidarScan, config: ScanMeshConfig, keep: Bool | None) -> tuple
     used = np.flatnonzero(near if keep is None else near & keep)
     directions, ranges = scan.directions[used].astype(np.float64), scan.ranges[used].astype(np.float64)
     azimuth = np.floor(np.arctan2(directions[:, 1], directions[:, 0]) / config.azimuth_cell).astype(np.int64)
-    elevation = np.floor(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)) / config.elevation_cell).astype(np.int64)
-    order = np.lexsort((ranges, elevation, azimuth))
+    elevation = np.arcsin(np.clip(directions[:, 2], -1.0, 1.0))
+    cells = np.empty(len(used), np.int64)
+    order = np.lexsort((elevation, azimuth))
+    cells[order] = _grouped(azimuth[order], elevation[order], config.elevation_cell)
+    order = np.lexsort((ranges, cells))
     directions, ranges = directions[order], ranges[order]
-    new = np.ones(len(order), bool)
-    new[1:] = (np.diff(azimuth[order]) != 0) | (np.diff(elevation[order]) != 0)
-    starts = np.flatnonzero(new)
+    starts = np.flatnonzero(np.diff(cells[order], prepend=-1))
     counts = np.diff(np.append(starts, len(order)))
     if not len(starts):
         return np.empty((0, 3)), np.empty(0)
     means = np.add.reduceat(directions, starts, axis=0)
     means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-12)
     return means, ranges[starts + (counts - 1) // 2]
+
+
+@njit(cache=True, nogil=True)
+def _grouped(columns, elevations, span):
+    """(N,) running number of the cell of each shot, of shots sorted by column and elevation.
+
+    Cells begin at their lowest shot, so that none splits a ring, whose shots would then make two vertices that all but
+    coincide, and triangles between them that point anywhere.
+    """
+    cells = np.empty(len(columns), np.int64)
+    cell, column, lowest = -1, 0, 0.0
+    for i in range(len(columns)):
+        if i == 0 or columns[i] != column or elevations[i] - lowest > span:
+            cell, column, lowest = cell + 1, columns[i], elevations[i]
+        cells[i] = cell
+    return cells
 
 
 def _seen(points: Float64, faces: npt.NDArray[np.integer], config: ScanMeshConfig) -> Mesh:
