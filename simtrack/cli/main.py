@@ -8,6 +8,7 @@ import simtrack
 from simtrack.cli import console
 from simtrack.cli.bench import bench
 from simtrack.cli.generate import generate
+from simtrack.cli.inspect import inspect
 from simtrack.cli.objects import objects
 from simtrack.cli.query import query
 from simtrack.cli.replay import replay
@@ -20,6 +21,7 @@ VERBS = {
     "run": run,
     "replay": replay,
     "generate": generate,
+    "inspect": inspect,
     "validate": validate,
     "scenes": scenes,
     "objects": objects,
