@@ -10,6 +10,7 @@ from simtrack.contracts import Float64, Int32, Relation
 from simtrack.datasets.annotate import Annotator, Owners
 from simtrack.datasets.cameras import CameraShell
 from simtrack.datasets.content import ColorRenderer, Content
+from simtrack.datasets.effects import Effects
 from simtrack.datasets.frame import LabelledFrame, SceneInfo, StuffCategory
 from simtrack.datasets.looks import Wardrobe
 from simtrack.datasets.mujoco_renderer import MujocoColorRenderer
@@ -74,8 +75,9 @@ class SettledScenes:
         self._stuff = self._all_stuff()
         intrinsics = recipe.camera.intrinsics
         self._shell = CameraShell(recipe.views, intrinsics)
-        self._annotator = Annotator(intrinsics, FAR)
+        self._annotator, self._relations = Annotator(intrinsics, FAR), Relations()
         self._renderer = _renderer(recipe)
+        self._effects = Effects(recipe.effects, intrinsics, linear=recipe.renderer == "pyrender")
         self.stuff = tuple(self._stuff.values())
 
     def scenes(self, count: int) -> int:
@@ -138,7 +140,7 @@ class SettledScenes:
         )
         categories = [category_of(self._stuff, part.semantic_class, False) for part in parts]
         categories += [thing.category or category_of(self._stuff, thing.semantic_class, True) for thing in things]
-        relations = Relations().of(things, map_entities(stage.static), settled.support)
+        relations = self._relations.of(things, map_entities(stage.static), settled.support)
         return _Scene(content, owners, np.array(categories, np.int32), relations, middle)
 
     def _stage(self, scene: int) -> Stage:
@@ -159,6 +161,8 @@ class SettledScenes:
         noise = random_of(self._seed, "depth", scene, index)
         intrinsics = self._recipe.camera.intrinsics
         depth = apply_depth_noise(view.depth, view.normals, intrinsics, self._noise, noise)
+        rgb = self._renderer.render(T_map_camera)
+        rgb = self._effects.apply(rgb, content, view, T_map_camera, random_of(self._seed, "effects", scene, index))
         labels = self._annotator.annotate(content.things, content.rays, T_map_camera, view.ids, depth)
         return LabelledFrame(
             scene=scene,
@@ -166,7 +170,7 @@ class SettledScenes:
             stamp=index * PERIOD,
             intrinsics=intrinsics,
             T_map_camera=T_map_camera,
-            rgb=self._renderer.render(T_map_camera),
+            rgb=rgb,
             depth=depth,
             clean_depth=view.depth,
             normals=view.normals,
@@ -198,4 +202,4 @@ def _renderer(recipe: Recipe) -> ColorRenderer:
         return MujocoColorRenderer(intrinsics, recipe.effects.antialiasing**2)
     from simtrack.datasets.pbr_renderer import PbrRenderer
 
-    return PbrRenderer(intrinsics)
+    return PbrRenderer(intrinsics, recipe.effects.antialiasing**2)
