@@ -59,7 +59,7 @@ def replay(
     if view or rrd is not None:
         raise InvalidValueError("view, rrd", str(source), "only with an MCAP file")
     log = open_log(source, CameraOptions(intrinsics, depth_unit))
-    with console.ProgressLine(f"replay of {log.path.name}: {log.format}", "opening") as line:
+    with console.ProgressLine(f"replay of {log.path.name}", log.format) as line:
         metrics, stopped = SensorReplay(log, folder, overwrite, threads, line.update).run()
     _summarise(metrics)
     console.show_written(folder, ["estimates.csv", "frames.csv", "metrics.json", "map.ply"])

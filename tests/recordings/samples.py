@@ -20,7 +20,7 @@ from simtrack.geometry.transforms import (
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 from simtrack.sensors.lidar import VLP16, LidarShots
 
-CAMERA = CameraIntrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
+CAMERA = CameraIntrinsics(320, 240, 280.0, 280.0, 159.5, 119.5)
 LIDAR_START = transform(exp_so3(np.array([0.1, 0.5, 0.0])), (0.2, -0.3, 1.2))
 """Tilted: level, it would see nothing but upright walls in so small a room, and not its own height."""
 
@@ -129,7 +129,7 @@ def write_open3d(folder: Path, depths: Sequence[Float32], poses: Sequence[Float6
         rows += [f"{k} {k} {k + 1}", *(" ".join(map(repr, row)) for row in T.tolist())]
     (folder / "trajectory.log").write_text("\n".join(rows) + "\n")
     matrix = CAMERA.matrix.T.ravel().tolist()
-    (folder / "camera_intrinsic.json").write_text(json.dumps({"width": 160, "height": 120, "intrinsic_matrix": matrix}))
+    (folder / "camera_intrinsic.json").write_text(json.dumps({"width": 320, "height": 240, "intrinsic_matrix": matrix}))
     return folder
 
 

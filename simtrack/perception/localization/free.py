@@ -45,13 +45,13 @@ class FreeConfig:
     """Metres: nearer lidar returns are not used."""
     max_range: float = 100.0
     """Metres: farther ones neither."""
-    depth_stride: int = 4
-    """Every how many-th row and column of a depth image is used."""
+    depth_columns: int = 160
+    """About so many columns of a depth image are used, and rows as far apart."""
     depth_max_range: float = 5.0
     """Metres."""
 
     def __post_init__(self) -> None:
-        for name in ("sigma", "sigma_angle", "max_range", "depth_max_range"):
+        for name in ("sigma", "sigma_angle", "max_range", "depth_columns", "depth_max_range"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"FreeConfig.{name}", getattr(self, name), "a finite number > 0")
         for name in ("steady", "min_share"):
@@ -94,7 +94,8 @@ class FreeLocalizer:
         """
         c = self.config
         if isinstance(frame, RgbdFrame):
-            return depth_measurement(frame, c.depth_stride, c.depth_max_range)
+            stride = max(1, round(frame.intrinsics.width / c.depth_columns))
+            return depth_measurement(frame, stride, c.depth_max_range)
         track = OdometryTrack(MotionConfig())
         for stamp in dict.fromkeys((frame.stamp, scan_end(frame))):
             track.add(Odometry(stamp, self.predicted(stamp), 0.0, 0.0))

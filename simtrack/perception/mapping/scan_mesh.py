@@ -26,8 +26,8 @@ class ScanMeshConfig:
     """Radians, likewise; below the distance between two rings."""
     max_gap: float = 0.06
     """Radians, opening (half) of the widest cone between lidar shots that counts as seen."""
-    block: int = 4
-    """Pixels: so many rows and columns of a depth image become one vertex."""
+    columns: int = 160
+    """About so many vertices stand in a row of a depth image, each of a square block of pixels."""
     min_grazing: float = 0.17
     """Radians between ray and surface below which a triangle is dropped."""
     max_edge: float = 2.0
@@ -43,8 +43,8 @@ class ScanMeshConfig:
         for name in ("azimuth_cell", "elevation_cell", "max_gap", "max_edge", "max_range", "max_depth"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"ScanMeshConfig.{name}", getattr(self, name), "a finite number > 0")
-        if self.block < 1:
-            raise InvalidValueError("ScanMeshConfig.block", self.block, "1 or more pixels")
+        if self.columns < 2:
+            raise InvalidValueError("ScanMeshConfig.columns", self.columns, "2 or more")
         if not 0.0 <= self.min_grazing < np.pi / 2:
             raise InvalidValueError("ScanMeshConfig.min_grazing", self.min_grazing, "0 to pi/2 radians")
 
@@ -95,7 +95,8 @@ def mesh_of_depth(frame: RgbdFrame, config: ScanMeshConfig | None = None, keep: 
     depth = np.where((depth >= config.min_range) & (depth <= config.max_depth), depth, np.nan)
     if keep is not None:
         depth[~keep] = np.nan
-    block, camera = config.block, frame.intrinsics
+    camera = frame.intrinsics
+    block = max(1, round(camera.width / config.columns))
     rows, columns = depth.shape[0] // block, depth.shape[1] // block
     blocks = depth[: rows * block, : columns * block].reshape(rows, block, columns, block)
     blocks = blocks.transpose(0, 2, 1, 3).reshape(rows, columns, block * block)

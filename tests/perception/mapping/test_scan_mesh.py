@@ -12,6 +12,7 @@ from simtrack.raycast import RayScene, TriangleMesh
 from simtrack.sensors.lidar import VLP16
 
 CAMERA = CameraIntrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
+COARSE = ScanMeshConfig(columns=40)
 
 
 def image(depth: np.ndarray) -> RgbdFrame:
@@ -47,14 +48,14 @@ def distances_to(mesh: Mesh, points: Float64) -> Float64:
 
 
 def test_a_plane_comes_back_from_depth() -> None:
-    mesh = mesh_of_depth(image(tilted_plane()))
+    mesh = mesh_of_depth(image(tilted_plane()), COARSE)
     np.testing.assert_allclose(mesh.vertices[:, 2], 2.0 + 0.4 * mesh.vertices[:, 0], atol=2e-4)
     assert len(mesh.faces) == 2 * (30 - 1) * (40 - 1) and faces_the_origin(mesh)
 
 
 def test_readings_are_merged_before_they_are_joined() -> None:
-    merged = mesh_of_depth(image(tilted_plane(0.01)))
-    single = mesh_of_depth(image(tilted_plane(0.01)), ScanMeshConfig(block=1, min_grazing=0.0))
+    merged = mesh_of_depth(image(tilted_plane(0.01)), COARSE)
+    single = mesh_of_depth(image(tilted_plane(0.01)), ScanMeshConfig(min_grazing=0.0))
     errors = [mesh.vertices[:, 2] - 2.0 - 0.4 * mesh.vertices[:, 0] for mesh in (merged, single)]
     assert errors[0].std() < 0.4 * errors[1].std()
 
@@ -145,6 +146,6 @@ def test_scans_without_a_surface_give_empty_meshes() -> None:
 
 
 def test_settings_outside_their_domain_are_named() -> None:
-    for name, value in (("block", 0), ("max_edge", 0.0), ("min_grazing", 2.0), ("azimuth_cell", float("nan"))):
+    for name, value in (("columns", 1), ("max_edge", 0.0), ("min_grazing", 2.0), ("azimuth_cell", float("nan"))):
         with pytest.raises(InvalidValueError, match=name):
             ScanMeshConfig(**{name: value})  # type: ignore[arg-type]
