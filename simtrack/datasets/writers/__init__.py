@@ -11,6 +11,10 @@
 ``mcap``                  ROS 2 logs, one a scene
 ``labels``                plain arrays and JSON: everything, among it normals, clean depth, support, relations
 ========================  =========================================================================================
+
+What a format wants in one file for all scenes is put together at the end, line by line, from what each scene left in
+the hidden folder ``.fragments`` of the format; shards of webdatasets are second names (hard links) of each scene's
+archives in ``.scenes``. Copies that do not keep hard links are larger (``cp -a``, ``rsync -aH`` and ``tar`` do).
 """
 
 from collections.abc import Callable, Mapping

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from simtrack.contracts import Bool, Int32
 from simtrack.datasets.frame import InstanceLabel, LabelledFrame
@@ -50,58 +49,15 @@ def uncompressed_rle(mask: Mask) -> dict[str, Any]:
 
 def compressed_rle(mask: Mask) -> dict[str, Any]:
     """COCO's run lengths in a string, as its own tools write them."""
-    return {"size": list(mask.shape), "counts": _characters(_run_lengths(mask)).tobytes().decode("ascii")}
+    from simtrack.datasets.writers.mask_kernels import characters
+
+    return {"size": list(mask.shape), "counts": characters(_run_lengths(mask)).tobytes().decode("ascii")}
 
 
 def _run_lengths(mask: Mask) -> np.ndarray:
-    return _runs(np.ascontiguousarray(mask.pixels), *mask.at, *mask.shape)
+    from simtrack.datasets.writers.mask_kernels import run_lengths
 
-
-@njit(cache=True, nogil=True)
-def _runs(part, u0, v0, height, width):
-    counts = np.empty(2 * part.size + 2, np.int64)
-    count, begin, inside = 0, 0, False
-    for u in range(part.shape[1]):
-        for v in range(part.shape[0]):
-            # Rows above and below the part are outside of the mask.
-            if v == 0 and v0 > 0 and inside:
-                end = (u0 + u) * height
-                counts[count] = end - begin
-                count, begin, inside = count + 1, end, False
-            if part[v, u] != inside:
-                end = (u0 + u) * height + v0 + v
-                counts[count] = end - begin
-                count, begin, inside = count + 1, end, not inside
-        last = v0 + part.shape[0]
-        if inside and last < height:
-            end = (u0 + u) * height + last
-            counts[count] = end - begin
-            count, begin, inside = count + 1, end, False
-    if inside:
-        end = (u0 + part.shape[1]) * height
-        counts[count] = end - begin
-        count, begin = count + 1, end
-    if begin < height * width:
-        counts[count] = height * width - begin
-        count += 1
-    return counts[:count]
-
-
-@njit(cache=True, nogil=True)
-def _characters(counts):
-    """COCO's code: each count less the one before the last, five bits a character, the lowest first."""
-    out = np.empty(7 * counts.size, np.uint8)
-    size = 0
-    for i in range(counts.size):
-        rest = counts[i] - counts[i - 2] if i > 2 else counts[i]
-        more = True
-        while more:
-            bits = rest & 31
-            rest >>= 5
-            more = rest != -1 if bits & 16 else rest != 0
-            out[size] = (bits | 32 if more else bits) + 48
-            size += 1
-    return out[:size]
+    return run_lengths(np.ascontiguousarray(mask.pixels), *mask.at, *mask.shape)
 
 
 def polygon(mask: Mask) -> Int32:
@@ -141,18 +97,8 @@ class _Waiting:
 
     def look_at(self, other: Int32) -> None:
         """Take another connected ring into account."""
-        gap, leave, reach = _closest(self.ring, other)
+        from simtrack.datasets.writers.mask_kernels import closest
+
+        gap, leave, reach = closest(self.ring, other)
         if gap < self.gap:
             self.gap, self.leave, self.reach = gap, leave, other[reach]
-
-
-@njit(cache=True, nogil=True)
-def _closest(ring, other):
-    """Squared distance of the two nearest points, and their places."""
-    best, here, there = np.iinfo(np.int64).max, 0, 0
-    for i in range(ring.shape[0]):
-        for k in range(other.shape[0]):
-            du, dv = np.int64(ring[i, 0] - other[k, 0]), np.int64(ring[i, 1] - other[k, 1])
-            if du * du + dv * dv < best:
-                best, here, there = du * du + dv * dv, i, k
-    return best, here, there

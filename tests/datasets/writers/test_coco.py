@@ -1,6 +1,7 @@
 """COCO as its own tools read it."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -171,3 +172,18 @@ def test_finishing_again_or_after_an_interruption_changes_nothing(tmp_path: Path
     write(other, [make_writer("coco")], Small(), [1, 0])
     writer.finish(other, INFO, 2)
     assert contents(other) == before
+
+
+def test_finishing_takes_no_more_memory_for_more_scenes(folder: Path, tmp_path: Path) -> None:
+    left = (folder / ".fragments" / "000000.jsonl").read_bytes()
+    peaks = []
+    for scenes in (80, 400):
+        root = tmp_path / str(scenes)
+        (root / "coco" / ".fragments").mkdir(parents=True)
+        for scene in range(scenes):
+            (root / "coco" / ".fragments" / f"{scene:06d}.jsonl").write_bytes(left)
+        tracemalloc.start()
+        make_writer("coco").finish(root, INFO, scenes)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] - peaks[0] < 20 * len(left)  # of 320 more scenes
