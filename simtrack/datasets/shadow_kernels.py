@@ -5,6 +5,9 @@ from numba import njit
 
 PERIOD = 3
 """Neighbouring sources of rays aim at different points of a light, again and again after this many."""
+SAMPLES = PERIOD * PERIOD
+MORE = 4
+"""Further samples of a source whose neighbours saw otherwise."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -60,30 +63,42 @@ def first_samples(points, normals, light):
 
 
 @njit(cache=True, nogil=True)
-def more_samples(lit, points, normals, light):
-    """Sources (N, 2) with a neighbour that saw otherwise, each eight times, with the samples (N,) it has not tried."""
+def _edges(lit):
+    """(h, w), whether one of the eight neighbours differs."""
     h, w = lit.shape
-    disagree = np.zeros((h, w), np.bool_)
-    count = 0
+    out = np.zeros((h, w), np.bool_)
     for i in range(h):
         for j in range(w):
-            if not _faces(points, normals, i, j, light):
+            for a, b in ((i, j + 1), (i + 1, j - 1), (i + 1, j), (i + 1, j + 1)):
+                if a < h and 0 <= b < w and lit[a, b] != lit[i, j]:
+                    out[i, j] = out[a, b] = True
+    return out
+
+
+@njit(cache=True, nogil=True)
+def more_samples(lit, points, normals, light):
+    """Sources (N, 2) with a neighbour that saw otherwise, `MORE` times each, with samples (N,) it has not tried yet."""
+    h, w = lit.shape
+    chosen = np.empty((h * w, 2), np.int32)
+    count, edges = 0, _edges(lit)
+    for i in range(h):
+        for j in range(w):
+            if not (edges[i, j] and _faces(points, normals, i, j, light)):
                 continue
+            differs = False
             for a in range(max(i - 1, 0), min(i + 2, h)):
                 for b in range(max(j - 1, 0), min(j + 2, w)):
-                    disagree[i, j] |= lit[a, b] != lit[i, j] and _same_surface(points, normals, i, j, a, b)
-            count += disagree[i, j]
-    rest = PERIOD * PERIOD - 1
-    where, which = np.empty((rest * count, 2), np.int32), np.empty(rest * count, np.int32)
-    n = 0
-    for i in range(h):
-        for j in range(w):
-            if disagree[i, j]:
-                own = (i % PERIOD) * PERIOD + j % PERIOD
-                for sample in range(rest + 1):
-                    if sample != own:
-                        where[n, 0], where[n, 1], which[n] = i, j, sample
-                        n += 1
+                    if lit[a, b] != lit[i, j] and not differs:
+                        differs = _same_surface(points, normals, i, j, a, b)
+            if differs:
+                chosen[count, 0], chosen[count, 1] = i, j
+                count += 1
+    where, which = np.empty((MORE * count, 2), np.int32), np.empty(MORE * count, np.int32)
+    for n in range(count):
+        i, j = chosen[n]
+        for k in range(MORE):
+            where[MORE * n + k] = chosen[n]
+            which[MORE * n + k] = ((i % PERIOD) * PERIOD + j % PERIOD + 2 * (k + 1)) % SAMPLES
     return where, which
 
 
@@ -104,17 +119,22 @@ def shadow_rays(points, normals, where, which, light, across, skin):
 
 @njit(cache=True, nogil=True)
 def gather(where, blocked, first, lit):
-    """Enter what rays met: each source's only one, or eight more beside the first."""
+    """Enter what rays met: each source's first one, or `MORE` beside it."""
     if first:
         for n in range(len(where)):
             lit[where[n, 0], where[n, 1]] = np.float32(0.0 if blocked[n] else 1.0)
         return
-    rest = PERIOD * PERIOD - 1
-    for n in range(0, len(where), rest):
+    for n in range(0, len(where), MORE):
         seen = lit[where[n, 0], where[n, 1]]
-        for k in range(rest):
+        for k in range(MORE):
             seen += np.float32(0.0 if blocked[n + k] else 1.0)
-        lit[where[n, 0], where[n, 1]] = seen / np.float32(rest + 1)
+        lit[where[n, 0], where[n, 1]] = seen / np.float32(MORE + 1)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _alike(cosine, apart, square):
+    """Whether two points with normals at that cosine lie on one surface, `apart` off the plane of one of them."""
+    return cosine > 0.9 and apart * apart <= np.float32(0.09) * square + np.float32(4e-6)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -122,24 +142,19 @@ def _same_surface(points, normals, i, j, a, b):
     """Whether two sources lie on one surface, by their normals and distance from each other's plane."""
     p, q, n, m = points[i, j], points[a, b], normals[i, j], normals[a, b]
     x, y, z = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-    apart = abs(n[0] * x + n[1] * y + n[2] * z)
-    along = np.sqrt(x * x + y * y + z * z)
-    return n[0] * m[0] + n[1] * m[1] + n[2] * m[2] > 0.9 and apart <= 0.3 * along + 0.002
+    turn, apart = n[0] * m[0] + n[1] * m[1] + n[2] * m[2], n[0] * x + n[1] * y + n[2] * z
+    return _alike(turn, apart, x * x + y * y + z * z)
 
 
 @njit(cache=True, nogil=True)
 def smoothed(lit, points, normals):
     """(h, w), means over neighbours on the same surface."""
     h, w = lit.shape
-    out = np.empty((h, w), np.float32)
+    out, edges = np.empty((h, w), np.float32), _edges(lit)
     for i in range(h):
         for j in range(w):
-            low = high = lit[i, j]
-            for a in range(max(i - 1, 0), min(i + 2, h)):
-                for b in range(max(j - 1, 0), min(j + 2, w)):
-                    low, high = min(low, lit[a, b]), max(high, lit[a, b])
             out[i, j] = lit[i, j]
-            if low == high:
+            if not edges[i, j]:
                 continue
             total, count = np.float32(0.0), 0
             for a in range(max(i - 1, 0), min(i + 2, h)):
@@ -152,81 +167,85 @@ def smoothed(lit, points, normals):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def remaining(depth, normals, points, turned, lits, stride, camera, pose, lights, ambient):
-    """(H, W, 3), share of the diffuse light of ambient (3,) and lights (L, 11) that is left.
+def remaining(points, normals, lits, lights, ambient):
+    """(h, w, 3), share of the diffuse light of ambient (3,) and lights (L, 11) that sources keep.
 
-    `lits` (L, h, w) are the shares of the lights that sources `points` with normals `turned` (h, w, 3) see.
+    `lits` (L, h, w) are the shares of each light that they see.
     """
-    fx, fy, cx, cy = camera
-    height, width = depth.shape
     h, w = points.shape[:2]
-    T = pose.astype(np.float32)
-    out = np.ones((height, width, 3), np.float32)
+    out = np.ones((h, w, 3), np.float32)
     total, left = np.empty(3, np.float32), np.empty(3, np.float32)
-    weights, corners = np.empty(4, np.float32), np.empty((4, 2), np.int64)
-    for v in range(height):
-        for u in range(width):
-            z = depth[v, u]
-            if not z > 0.0:
+    for i in range(h):
+        for j in range(w):
+            shaded = False
+            for number in range(lights.shape[0]):
+                shaded |= lits[number, i, j] < 1.0
+            if not shaded:
                 continue
-            i, j = v // stride, u // stride
-            below, right = min(i + 1, h - 1), min(j + 1, w - 1)
-            x, y = np.float32((u - cx) / fx) * z, np.float32((v - cy) / fy) * z
-            px = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-            py = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-            pz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            a, b, c = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
-            nx = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
-            ny = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
-            nz = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
+            p, n = points[i, j], normals[i, j]
             for k in range(3):
                 total[k] = left[k] = ambient[k]
-            weighed = False
             for number in range(lights.shape[0]):
-                strength = _incidence(px, py, pz, nx, ny, nz, lights[number])
-                if strength <= 0.0:
-                    continue
-                lit = lits[number]
-                seen = lit[i, j]
-                if not (seen == lit[i, right] == lit[below, j] == lit[below, right]):
-                    if not weighed:
-                        _weigh(px, py, pz, nx, ny, nz, points, turned, v, u, stride, corners, weights)
-                        weighed = True
-                    seen = np.float32(0.0)
-                    for corner in range(4):
-                        seen += weights[corner] * lit[corners[corner, 0], corners[corner, 1]]
+                strength = _incidence(p[0], p[1], p[2], n[0], n[1], n[2], lights[number])
                 for k in range(3):
                     total[k] += strength * lights[number, 6 + k]
-                    left[k] += strength * lights[number, 6 + k] * seen
+                    left[k] += strength * lights[number, 6 + k] * lits[number, i, j]
             for k in range(3):
                 if total[k] > 0.0:
-                    out[v, u, k] = left[k] / total[k]
+                    out[i, j, k] = left[k] / total[k]
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(px, py, pz, nx, ny, nz, points, turned, v, u, stride, corners, weights):
-    """Corners (4, 2) and weights (4,) of the sources about a pixel: bilinear among those on its surface.
-
-    Where there are none, the nearest counts alone.
-    """
+def spread(shares, depth, normals, points, turned, stride, camera, pose):
+    """(H, W, 3), shares (h, w, 3) of sources `points` with normals `turned`, brought to all pixels."""
+    fx, fy, cx, cy = camera
+    height, width = depth.shape
     h, w = points.shape[:2]
-    whole, nearest, best = np.float32(0.0), np.float32(np.inf), 0
-    for corner in range(4):
-        i, j = v // stride + corner // 2, u // stride + corner % 2
-        near = max(stride - abs(v - i * stride), 0) * max(stride - abs(u - j * stride), 0)
-        i, j = min(i, h - 1), min(j, w - 1)
-        corners[corner, 0], corners[corner, 1] = i, j
-        q, m = points[i, j], turned[i, j]
-        dx, dy, dz = q[0] - px, q[1] - py, q[2] - pz
-        apart, square = abs(nx * dx + ny * dy + nz * dz), dx * dx + dy * dy + dz * dz
-        same = nx * m[0] + ny * m[1] + nz * m[2] > 0.9 and apart <= 0.3 * np.sqrt(square) + 0.002
-        weights[corner] = near if same else 0.0
-        whole += weights[corner]
-        if square < nearest and m[0] * m[0] + m[1] * m[1] + m[2] * m[2] > 0.0:
-            nearest, best = square, corner
-    for corner in range(4):
-        if whole > 0.0:
-            weights[corner] /= whole
-        else:
-            weights[corner] = np.float32(corner == best)
+    T = pose.astype(np.float32)
+    plain = np.empty((h, w), np.bool_)
+    for i in range(h):
+        for j in range(w):
+            plain[i, j] = True
+            for a in range(i, min(i + 2, h)):
+                for b in range(j, min(j + 2, w)):
+                    for k in range(3):
+                        plain[i, j] &= shares[a, b, k] == 1.0
+    out = np.ones((height, width, 3), np.float32)
+    for v in range(height):
+        y = np.float32((v - cy) / fy)
+        for u in range(width):
+            z = depth[v, u]
+            if plain[v // stride, u // stride] or not z > 0.0:
+                continue
+            x = np.float32((u - cx) / fx)
+            px = (T[0, 0] * x + T[0, 1] * y + T[0, 2]) * z + T[0, 3]
+            py = (T[1, 0] * x + T[1, 1] * y + T[1, 2]) * z + T[1, 3]
+            pz = (T[2, 0] * x + T[2, 1] * y + T[2, 2]) * z + T[2, 3]
+            a, b, c = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
+            nx = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
+            ny = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
+            nz = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
+            red, green, blue, whole = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            nearest, best_i, best_j = np.float32(np.inf), v // stride, u // stride
+            for i in range(v // stride, min(v // stride + 2, h)):
+                for j in range(u // stride, min(u // stride + 2, w)):
+                    near = np.float32(max(stride - abs(v - i * stride), 0) * max(stride - abs(u - j * stride), 0))
+                    if near == 0.0:
+                        continue
+                    dx, dy, dz = points[i, j, 0] - px, points[i, j, 1] - py, points[i, j, 2] - pz
+                    mx, my, mz = turned[i, j, 0], turned[i, j, 1], turned[i, j, 2]
+                    square = dx * dx + dy * dy + dz * dz
+                    if _alike(nx * mx + ny * my + nz * mz, nx * dx + ny * dy + nz * dz, square):
+                        red += near * shares[i, j, 0]
+                        green += near * shares[i, j, 1]
+                        blue += near * shares[i, j, 2]
+                        whole += near
+                    elif square < nearest and mx * mx + my * my + mz * mz > 0.0:
+                        nearest, best_i, best_j = square, i, j
+            if whole > 0.0:
+                out[v, u, 0], out[v, u, 1], out[v, u, 2] = red / whole, green / whole, blue / whole
+            else:
+                for k in range(3):
+                    out[v, u, k] = shares[best_i, best_j, k]
+    return out
