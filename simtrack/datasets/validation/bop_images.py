@@ -200,12 +200,15 @@ def shard_images(report: Report, folder: Path) -> Iterator[BopImage]:
 def _members(path: Path) -> dict[str, dict[str, bytes]]:
     """Image -> extension -> content."""
     out: dict[str, dict[str, bytes]] = {}
-    with tarfile.open(path) as archive:
-        for member in archive:
-            key, _, extension = member.name.partition(".")
-            stream = archive.extractfile(member)
-            if stream is not None:
-                out.setdefault(key, {})[extension] = stream.read()
+    try:
+        with tarfile.open(path) as archive:
+            for member in archive:
+                key, _, extension = member.name.partition(".")
+                stream = archive.extractfile(member)
+                if stream is not None:
+                    out.setdefault(key, {})[extension] = stream.read()
+    except tarfile.TarError as error:
+        raise FileFormatError(path, "", f"is no archive: {str(error).splitlines()[0]}") from error
     return out
 
 

@@ -53,6 +53,8 @@ def edge_free(mask: Bool, margin: int) -> Bool:
     """The mask without what lies within `margin` pixels of its edge; the image's border is no edge."""
     import cv2
 
+    if not mask.any():
+        return mask
     size = 2 * margin + 1
     border = cv2.BORDER_REPLICATE
     return cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8), borderType=border) > 0

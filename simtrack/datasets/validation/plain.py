@@ -76,8 +76,7 @@ def validate_labels(report: Report, root: Path) -> int:
                 stamps.append(labels.stamp)
                 _check_labels(report, path, labels, arrays)
             count += 1
-        rows = report.read(folder / "trajectory.csv", lambda file: list(csv.DictReader(file.open(encoding="ascii"))))
-        found = [int(row.get("stamp") or -1) for row in rows or []]
+        found = report.read(folder / "trajectory.csv", _stamps) or []
         report.equal(folder / "trajectory.csv", "stamp", found, stamps)
     return count
 
@@ -85,6 +84,11 @@ def validate_labels(report: Report, root: Path) -> int:
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     with np.load(path, allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files}
+
+
+def _stamps(path: Path) -> list[int]:
+    with path.open(encoding="ascii", newline="") as stream:
+        return [int(row["stamp"]) for row in csv.DictReader(stream)]
 
 
 def _check_labels(report: Report, path: Path, labels: _Labels, arrays: dict[str, np.ndarray]) -> None:

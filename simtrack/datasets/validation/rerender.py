@@ -122,10 +122,11 @@ class Rerenderer:
         seen, measured = image.visible[k], image.depth
         if seen is None or measured is None or seen.shape != measured.shape or measured.shape != depth.shape:
             return
-        chosen = edge_free(seen & ~creases(depth), EDGE) & (measured > 0) & (depth > 0)
+        off = self.noise is not None and is_off(self.noise)
+        chosen = edge_free(seen & ~creases(depth), 1 if off else EDGE) & (measured > 0) & (depth > 0)
         residuals, z, cosine = measured[chosen] - depth[chosen], depth[chosen], cosines[chosen]
         self.residuals.append(residuals)
-        if len(residuals) < MIN_READINGS:
+        if len(residuals) < (1 if off else MIN_READINGS):
             return
         step = image.camera.depth_scale / 1000.0
         path, _ = image.about["depth"]
@@ -136,7 +137,7 @@ class Rerenderer:
                 middle <= FOREIGN_DEPTH, path, name, f"depth {1e3 * middle:.1f} mm off the model (median)",
                 f"at most {1e3 * FOREIGN_DEPTH:g} mm",
             )  # fmt: skip
-        elif is_off(self.noise):
+        elif off:
             largest = float(np.abs(residuals).max())
             report.holds(
                 largest <= EXACT_DEPTH, path, name, f"depth up to {1e3 * largest:.2f} mm off the model",
