@@ -13,8 +13,9 @@ from simtrack.datasets.stages import Stage
 from simtrack.datasets.textures import image_texture, random_color, texture
 from simtrack.geometry.meshes import Mesh, area, subdivide_to
 
-FACE_AREA = 0.02
-"""Square metres: faces of buildings are cut to about this size, for renderers that light vertices alone."""
+FACE_AREA, SUPPORT_AREA = 0.1, 0.01
+"""Square metres: faces of the building, and of the part that carries things, are cut to about this size, for renderers
+that light vertices alone."""
 
 
 class Wardrobe:
@@ -35,7 +36,7 @@ class Wardrobe:
         for part in stage.static.parts:
             if not len(part.mesh.faces):
                 continue
-            mesh = _cut(part.mesh)
+            mesh = _cut(part.mesh, SUPPORT_AREA if part.name == stage.support else FACE_AREA)
             if part.name not in stage.textured:
                 shapes.append(Shape(_shifted(mesh, self._materials, shift), part.T_map_part, plain))
                 continue
@@ -99,9 +100,9 @@ def _light(settings: LightSettings, middle: Float64, strength: float, rng: np.ra
 # -------------------------------------------------------------------------------------------------------------- colours
 
 
-def _cut(mesh: Mesh) -> Mesh:
-    """The same surface in smaller faces."""
-    wanted = int(area(mesh) / FACE_AREA)
+def _cut(mesh: Mesh, face_area: float) -> Mesh:
+    """The same surface in smaller faces, of so many square metres on average."""
+    wanted = int(area(mesh) / face_area)
     return mesh if wanted <= len(mesh.faces) else subdivide_to(mesh, wanted)
 
 

@@ -204,7 +204,7 @@ class DriveViews(Strict):
     """
 
     kind: Literal["drive"]
-    duration: float = Field(default=20.0, ge=1.0, le=3600.0)
+    duration: float = Field(default=20.0, ge=0.1, le=3600.0)
     """Seconds of a drive; a scene is one drive."""
     rate: float = Field(default=10.0, gt=0.0, le=30.0)
     """Labelled images a second; rounded to every n-th one of the camera."""
