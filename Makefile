@@ -53,7 +53,7 @@ $(INSTALLED): pyproject.toml
 	fi
 	@echo 'Installing simtrack into $(VENV): a few minutes the first time.'
 	@[ -x $(BIN)/python ] || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,viz]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,viz,distributed]'
 	@$(MAKE) --no-print-directory opengl
 	@touch $@
 

@@ -62,5 +62,13 @@ class OutputExistsError(SimtrackError):
         super().__init__(f"output folder {path} exists already; choose another --out or pass --overwrite")
 
 
+class DatasetError(SimtrackError):
+    """A data set's folder that cannot be written to or completed: names the folder and the reason."""
+
+    def __init__(self, path: str | Path, reason: str) -> None:
+        self.path, self.reason = Path(path), reason
+        super().__init__(f"data set {path}: {reason}")
+
+
 class QueryError(SimtrackError):
     """A scene-graph query that cannot be parsed or names unknown things."""

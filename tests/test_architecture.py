@@ -36,13 +36,15 @@ ROOMS = (
 
 HIDDEN_FROM_PERCEPTION = {"simulation", "recordings", "datasets", "evaluation", "envs", "report", "benchmarks", "cli"}
 HEAVY = {"numba", "scipy", "trimesh", "cv2", "mujoco", "skimage", "shapely", "pyoxigraph", "matplotlib", "embreex"}
-HEAVY |= {"pydantic", "manifold3d", "mcap", "rerun", "tyro", "rich"}
+HEAVY |= {"pydantic", "manifold3d", "mcap", "rerun", "tyro", "rich", "ray"}
 IMPORT_NAMES = {
     "opencv-python-headless": "cv2",
     "scikit-image": "skimage",
     "pyyaml": "yaml",
     "rerun-sdk": "rerun",
     "mcap-ros2-support": "mcap_ros2",
+    "pyrender-maintained": "pyrender",
+    "pyopengl": "OpenGL",
 }
 """Packages that are imported by another name."""
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -103,7 +105,8 @@ def test_every_package_that_is_imported_is_a_declared_dependency() -> None:
     """A machine that has more installed would hide a missing one."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    declared = {re.split(r"[\[<>=~!; ]", line)[0] for line in project["dependencies"] + extras["viz"] + extras["bench"]}
+    lines = [*project["dependencies"], *extras["viz"], *extras["bench"], *extras["distributed"]]
+    declared = {re.split(r"[\[<>=~!; ]", line)[0] for line in lines}
     modules = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in declared} | {"simtrack"}
     modules |= {"llvmlite", "markupsafe", "pydantic_core"}  # halves of numba, jinja2 and pydantic
     modules |= set(sys.stdlib_module_names)

@@ -70,8 +70,8 @@ def show_table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: 
 class ProgressLine:
     """One live line in a terminal, a line of text now and then elsewhere; a context manager."""
 
-    def __init__(self, title: str) -> None:
-        self._title = title
+    def __init__(self, title: str, first: str = "building the world") -> None:
+        self._title, self._first = title, first
         self._bar: Bar | None = None
         self._task = None
         self._what = ""
@@ -89,7 +89,7 @@ class ProgressLine:
             self._bar = Progress(*columns, console=console, transient=True, expand=True, refresh_per_second=8)
             self._bar.start()
             self._task = self._bar.add_task(self._title, total=1.0, state="")
-        self.say("building the world")
+        self.say(self._first)
         return self
 
     def say(self, what: str, thing: str = "") -> None:
@@ -106,12 +106,16 @@ class ProgressLine:
             self._title = f"{self._title.split(' · ')[0]} · {progress.what}"
         self._what = progress.what
         whole = f"/{progress.duration:g}" if progress.duration else ""
+        objects = "" if progress.tracks is None else f"{progress.tracks} objects  "
         state = (
             f"{progress.seconds:.1f}{whole} s  {progress.frames_per_second:.1f} fps  "
-            f"{progress.tracks} objects  localization {progress.localization}"
+            f"{objects}localization {progress.localization}"
         )
+        self.show(state, progress.seconds / progress.duration if progress.duration else 0.0)
+
+    def show(self, state: str, share: float) -> None:
+        """Show a state, and the share of the work that is done, 0 to 1."""
         if self._bar is not None and self._task is not None:
-            share = progress.seconds / progress.duration if progress.duration else 0.0
             self._bar.update(self._task, description=self._title, completed=share, state=state)
         elif time.monotonic() - self._said >= QUIET_PERIOD:
             self._said = time.monotonic()

@@ -7,16 +7,22 @@ from collections.abc import Sequence
 import simtrack
 from simtrack.cli import console
 from simtrack.cli.bench import bench
+from simtrack.cli.generate import generate
+from simtrack.cli.inspect import inspect
 from simtrack.cli.objects import objects
 from simtrack.cli.query import query
 from simtrack.cli.replay import replay
 from simtrack.cli.run import run
 from simtrack.cli.scenes import scenes
 from simtrack.cli.trials import trials
+from simtrack.cli.validate import validate
 
 VERBS = {
     "run": run,
     "replay": replay,
+    "generate": generate,
+    "inspect": inspect,
+    "validate": validate,
     "scenes": scenes,
     "objects": objects,
     "query": query,

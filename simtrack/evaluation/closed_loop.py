@@ -81,8 +81,8 @@ class Progress:
     """Simulated so far."""
     duration: float
     frames_per_second: float
-    tracks: int
-    """Objects believed now."""
+    tracks: int | None
+    """Objects believed now; None where none are tracked."""
     localization: str
     """Its status."""
 

@@ -3,7 +3,8 @@
 ``config.yaml`` resolved configuration and versions; ``estimates.csv`` and ``tracks.csv`` what the stack believed of the
 robot and of every object; ``trajectory.csv`` true and believed pose of the base; ``poses.csv`` one line an
 object-frame; ``simtrack_<scene>-test.csv`` results in the format of the BOP challenge; ``graph.json`` the scene
-graph; ``metrics.json``; ``report.html``.
+graph; ``metrics.json``; ``report.html``. Of a recording without a robot: ``frames.csv`` how its frames compare with
+``map.ply``, the map that they make.
 """
 
 import csv
@@ -21,7 +22,7 @@ from simtrack.geometry.transforms import quaternion_from_rotation
 
 OWN_FILES = (
     "config.yaml", "estimates.csv", "tracks.csv", "trajectory.csv", "poses.csv", "graph.json", "metrics.json",
-    "report.html",
+    "report.html", "frames.csv", "map.ply",
 )  # fmt: skip
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 TRAJECTORY = ("stamp_ns", "status", *(f"{who}_{c}" for who in ("true", "estimated") for c in _POSE))
@@ -32,6 +33,10 @@ POSES = (
 )  # fmt: skip
 ESTIMATES = ("stamp_ns", "status", *_POSE)
 TRACKS = ("stamp_ns", "track", "class", "status", *_POSE, "visible_fraction", "moving", "score")
+FRAMES = (
+    "stamp_ns", "status", "readings", "covered", "explained", "residual_median", "residual_p95", "difference_median",
+    "unknown", "regions", "translation_error", "rotation_error", "map_faces",
+)  # fmt: skip
 BOP = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 
 
@@ -142,6 +147,21 @@ class TruthTables(_Tables):
         T, score = frame.track.T_camera_object, f"{frame.track.score:.6f}"
         R, t = (" ".join(f"{v:.8f}" for v in values) for values in (T[:3, :3].ravel(), 1000 * T[:3, 3]))
         return 1, image, self._object_ids[frame.class_name], score, R, t, -1
+
+
+class SensorTables(_Tables):
+    """Poses of a sensor that is its own base, and how its frames compare with the map."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._estimates = self._table(folder / "estimates.csv", ESTIMATES)
+        self._frames = self._table(folder / "frames.csv", FRAMES)
+
+    def add(self, stamp: int, status: str, T_map_sensor: Float64, values: Mapping[str, float]) -> None:
+        """Append one frame; `values` by the names of `FRAMES`, those that are missing stay empty."""
+        self._estimates.write([(stamp, status, *_pose(T_map_sensor))])
+        row = [f"{values[name]:.6g}" if name in values else "" for name in FRAMES[2:]]
+        self._frames.write([(stamp, status, *row)])
 
 
 class _Table:

@@ -36,6 +36,8 @@ MAX_YAML_BYTES = 100_000
 MAX_VISUAL_FACES = 3000
 MAX_SIZE = 5.0
 """Metres. A larger object was most likely drawn in millimetres."""
+MIN_SIZE = 0.0005
+"""Metres. A smaller object was most likely scaled from millimetres although it was drawn in metres."""
 DEFAULT_DENSITY = 500.0
 """kg/m^3, of an object that states neither mass nor density: a hollow thing of plastic and metal."""
 
@@ -174,15 +176,22 @@ def _inside(folder: Path, relative: str) -> Path:
 
 
 def _warn_about(mesh: Mesh, path: Path) -> None:
+    box = " x ".join(f"{side:.4g}" for side in mesh.extents)
     size = float(mesh.extents.max())
     if size > MAX_SIZE:
         warnings.warn(
-            f"mesh {path}: is {size:.4g} m large; if it was drawn in millimetres, set 'scale: 0.001' in {FILE_NAME}",
+            f"mesh {path}: measures {box} m; if it was drawn in millimetres, set 'scale: 0.001' in {FILE_NAME}",
+            stacklevel=3,
+        )
+    if size < MIN_SIZE:
+        warnings.warn(
+            f"mesh {path}: measures {box} m; if it was drawn in metres, leave 'scale' out of {FILE_NAME}",
             stacklevel=3,
         )
     if not meshes.is_closed(mesh):
         warnings.warn(
-            f"mesh {path}: is not closed (holes or inconsistent winding); mass and inertia are its convex hull's",
+            f"mesh {path}: is not closed (holes or inconsistent winding); it measures {box} m; "
+            "mass and inertia are its convex hull's",
             stacklevel=3,
         )
 

@@ -36,11 +36,8 @@ from simtrack.geometry.transforms import rotation_from_quaternion, transform
 from simtrack.objects import ObjectModel
 from simtrack.recordings import archive, layout, ros2
 from simtrack.recordings.container import Container, LogMessage
+from simtrack.recordings.log import RecordingWarning
 from simtrack.recordings.writer import CHUNK_BYTES, create_file
-
-
-class RecordingWarning(UserWarning):
-    """A recording that can be used, but not as a whole."""
 
 
 @dataclass(frozen=True, slots=True)

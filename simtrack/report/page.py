@@ -53,6 +53,7 @@ _CHANGING_FIRST = (
 
 
 if TYPE_CHECKING:
+    from jinja2 import Template
     from markupsafe import Markup
 
 
@@ -72,20 +73,14 @@ def write_report(record: RunRecord, path: Path) -> None:
 
 def render(record: RunRecord) -> str:
     """The report as HTML."""
-    import jinja2
-
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters["breakable"] = _breakable
-    template = environment.from_string(Path(__file__).with_name("template.html").read_text(encoding="utf-8"))
+    page = template("template.html")
     colors = class_colors([f.class_name for f in record.object_frames] + list(record.meshes))
     targets = targets_of(record.scene)
     layers, answers = ([], [])
     if record.query_frame is not None:
         layers, answers = query_layers(record.query_frame, record.meshes)
     chosen = choose_relations(record.believed_relations)
-    return template.render(
+    return page.render(
         record=record,
         version=simtrack.__version__,
         seconds=(record.end - record.start) / NANOSECONDS,
@@ -109,6 +104,18 @@ def render(record: RunRecord) -> str:
         stages=figures.stage_times(record),
         config=_config_text(record.config),
     )
+
+
+def template(name: str) -> "Template":
+    """A page's template in this folder."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["breakable"] = _breakable
+    return environment.get_template(name)
 
 
 def choose_relations(intervals: Sequence[Interval]) -> list[Interval]:

@@ -11,6 +11,7 @@ from simtrack.contracts import NANOSECONDS, CameraIntrinsics, Float64, Int32
 from simtrack.errors import UnknownNameError
 from simtrack.geometry.transforms import apply, difference, inverse
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
+from simtrack.simulation.contacts import SUPPORTING, contact_pairs
 from simtrack.simulation.history import KEY_NS, History
 from simtrack.simulation.world import SENSOR_BODIES, World, body_pose
 from simtrack.simulation.world_rays import WorldRays
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 CONTACT_WINDOW = 20_000_000
 """Nanoseconds: contacts within it count, so that one that chatters for a physics step does not flicker."""
-SUPPORTING = 0.5
-"""Cosine between a contact's normal and the vertical above which one thing stands on the other."""
 SILHOUETTE_RAYS = 900
 """About how many rays measure the visibility of one object."""
 
@@ -178,6 +177,11 @@ class GroundTruth:
         hits = self._rays.scene.cast(self._full, T_map_camera, min_distance=0.03)
         return self._rays.ids(hits).reshape(self._intrinsics.height, self._intrinsics.width)
 
+    def rays(self, stamp: int) -> WorldRays:
+        """The world as it was at a stamp, to cast rays at until the next question or step."""
+        self._load(stamp)
+        return self._rays
+
     def lidar_ids(self, stamp: int) -> Int32:
         """(N,), index into `names` of what each shot of the scan that began at `stamp` hit, -1 = nothing.
 
@@ -286,17 +290,7 @@ class _ContactLog:
         if fingerprint == self._last:  # mostly so: things rest
             return
         self._last = fingerprint
-        pairs = self._owner[geoms]
-        real = (pairs >= 0).all(axis=1) & ~apart & (pairs[:, 0] != pairs[:, 1])
-        first, second, up = pairs[real, 0], pairs[real, 1], up[real]
-        real = self._is_object[first] | self._is_object[second]
-        first, second, up = first[real], second[real], up[real]
-        base = len(self._names)
-        above = np.where(up > 0, second, first)
-        below = np.where(up > 0, first, second)
-        stands = (np.abs(up) > SUPPORTING) & self._is_object[above]
-        supports = np.unique((above * base + below)[stands])
-        touches = np.unique(np.minimum(first, second) * base + np.maximum(first, second))
+        supports, touches = contact_pairs(data, self._owner, self._is_object)
         last = self._sets[-1] if self._sets else None
         if last is None or not (np.array_equal(last[0], supports) and np.array_equal(last[1], touches)):
             self._keys.append(stamp)
@@ -305,12 +299,11 @@ class _ContactLog:
     def at(self, stamp: int) -> tuple[frozenset[tuple[str, str]], frozenset[tuple[str, str]]]:
         low = max(0, bisect_right(self._keys, stamp - CONTACT_WINDOW) - 1)
         high = max(low + 1, bisect_right(self._keys, stamp + CONTACT_WINDOW))
-        supports = {int(code) for kept in self._sets[low:high] for code in kept[0]}
-        touches = {int(code) for kept in self._sets[low:high] for code in kept[1]}
-        base = len(self._names)
+        supports = {(int(a), int(b)) for kept in self._sets[low:high] for a, b in kept[0]}
+        touches = {(int(a), int(b)) for kept in self._sets[low:high] for a, b in kept[1]}
 
-        def named(code: int) -> tuple[str, str]:
-            return self._names[code // base], self._names[code % base]
+        def named(pair: tuple[int, int]) -> tuple[str, str]:
+            return self._names[pair[0]], self._names[pair[1]]
 
         pairs = frozenset((a, b) if a < b else (b, a) for a, b in map(named, touches))
         return frozenset(map(named, supports)), pairs

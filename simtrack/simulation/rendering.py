@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
-from simtrack.contracts import CameraIntrinsics, Float32, Int32, Uint8
+from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, Int32, Uint8
 from simtrack.errors import InvalidValueError, RenderingError
 from simtrack.geometry.transforms import transform
 from simtrack.raycast import RayBundle, RayHits
@@ -15,6 +15,7 @@ from simtrack.simulation.world_rays import WorldRays
 
 if TYPE_CHECKING:
     import mujoco
+    from mujoco.egl import GLContext
 
 RENDERERS = ("mujoco", "embree")
 BACKGROUND = (0.62, 0.72, 0.82)
@@ -84,7 +85,8 @@ class MujocoRenderer:
         centred = (intrinsics.cx, intrinsics.cy) == ((intrinsics.width - 1) / 2, (intrinsics.height - 1) / 2)
         if not centred or intrinsics.fx != intrinsics.fy:
             raise InvalidValueError("intrinsics", intrinsics, "cx = (width - 1) / 2, cy = (height - 1) / 2, fx = fy")
-        self._gl, self._context = _egl_context(world.model, intrinsics)
+        self._gl = gl_context(intrinsics)
+        self._context = gl_resources(world.model)
         import mujoco
 
         self._model, self._far = world.model, far
@@ -133,7 +135,7 @@ class MujocoRenderer:
         options.sitegroup[:] = 0
         kept = self._model.geom_group.copy()
         # Vertices are what costs under a software rasteriser: what cannot be in the image is not handed to it.
-        self._model.geom_group[~self._in_view(data, far)] = COLLISION
+        self._model.geom_group[~in_view(self._model, data, self._camera.fixedcamid, self._half, far)] = COLLISION
         try:
             category = mujoco.mjtCatBit.mjCAT_ALL
             mujoco.mjv_updateScene(self._model, data, options, None, self._camera, category, self._scene)
@@ -149,15 +151,6 @@ class MujocoRenderer:
         mujoco.mjr_readPixels(
             self._color if color else None, self._buffer if depth else None, self._rect, self._context
         )
-
-    def _in_view(self, data: "mujoco.MjData", far: float) -> np.ndarray:
-        """(ngeom,), whether the bounding sphere of a geom reaches into the view."""
-        camera = self._camera.fixedcamid
-        local = (data.geom_xpos - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3)
-        reach = np.where(self._model.geom_rbound > 0, self._model.geom_rbound, np.inf)
-        ahead, sides = -local[:, 2], np.abs(local[:, :2])
-        outside = (sides - ahead[:, None] * self._half) / np.sqrt(1.0 + self._half**2)
-        return (ahead > -reach) & (ahead < far + reach) & (outside < reach[:, None]).all(axis=1)
 
     def _metres(self) -> Float32:
         """Undo the projection (reversed z in 0..1, far = 0) in float64, top row first."""
@@ -180,21 +173,39 @@ class MujocoRenderer:
             self._gl.free()
 
 
-def _egl_context(model: "mujoco.MjModel", intrinsics: CameraIntrinsics):
-    """An EGL context and MuJoCo's resources in it; raises RenderingError if there is no working EGL."""
+def gl_context(intrinsics: CameraIntrinsics) -> "GLContext":
+    """A current EGL context for images of that size; raises RenderingError if there is no working EGL."""
     os.environ.setdefault("MUJOCO_GL", "egl")
     try:
-        import mujoco
         from mujoco.egl import GLContext
 
         gl = GLContext(intrinsics.width, intrinsics.height)
     except Exception as error:  # PyOpenGL raises what it likes: AttributeError, ImportError, EGLError, RuntimeError
         raise RenderingError(f"OpenGL cannot be used without a display here (EGL: {error!r:.120}).") from error
     gl.make_current()
+    return gl
+
+
+def gl_resources(model: "mujoco.MjModel") -> "mujoco.MjrContext":
+    """MuJoCo's resources for a model in the current OpenGL context, for drawing off screen."""
+    import mujoco
+
     context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
     context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-    return gl, context
+    return context
+
+
+def in_view(model: "mujoco.MjModel", data: "mujoco.MjData", camera: int, half: Float64, far: float) -> Bool:
+    """(ngeom,), whether the bounding sphere of a geom reaches into the view of a camera.
+
+    `half` (2,) are the tangents of half the angles of view, `far` is in metres along the optical axis.
+    """
+    local = (data.geom_xpos - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3)
+    reach = np.where(model.geom_rbound > 0, model.geom_rbound, np.inf)
+    ahead, sides = -local[:, 2], np.abs(local[:, :2])
+    outside = (sides - ahead[:, None] * half) / np.sqrt(1.0 + half**2)
+    return (ahead > -reach) & (ahead < far + reach) & (outside < reach[:, None]).all(axis=1)
 
 
 class EmbreeRenderer:

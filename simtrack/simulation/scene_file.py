@@ -9,55 +9,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 from pydantic_core import PydanticCustomError
 
 from simtrack.errors import FileFormatError, UnknownNameError
 from simtrack.paths import scene_roots
+from simtrack.simulation.strict_file import Name, Range, Strict, Vector, read_document, validated
 
 FILE_NAME = "scene.yaml"
-MAX_BYTES = 1_000_000
 MAX_INSTANCES = 200
 PI = 3.141592653589793
 
-Name: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
-Range: TypeAlias = tuple[float, float]
-Vector: TypeAlias = tuple[float, float, float]
 
-
-class _Strict(BaseModel):
-    """Refuses unknown fields by naming the known ones, and pairs [low, high] that are the wrong way round."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _known_fields(cls, data: Any) -> Any:
-        if isinstance(data, dict):
-            known = {field.alias or name for name, field in cls.model_fields.items()}
-            if unknown := sorted(str(key) for key in data if key not in known):
-                message = "unknown field {unknown}; allowed: {known}"
-                raise PydanticCustomError(
-                    "unknown_field", message, {"unknown": ", ".join(unknown), "known": ", ".join(sorted(known))}
-                )
-        return data
-
-    @model_validator(mode="after")
-    def _ordered_ranges(self) -> "_Strict":
-        for name, field in type(self).model_fields.items():
-            value = getattr(self, name)
-            if (
-                isinstance(value, tuple)
-                and len(value) == 2
-                and "float" in str(field.annotation)
-                and value[0] > value[1]
-            ):
-                raise PydanticCustomError("range", "{name} is [low, high] and low must not exceed high", {"name": name})
-        return self
-
-
-class Pose(_Strict):
+class Pose(Strict):
     """A pose in the map."""
 
     xyz: Vector
@@ -66,7 +30,7 @@ class Pose(_Strict):
     """Radians: Rz(yaw) Ry(pitch) Rx(roll)."""
 
 
-class Placement(_Strict):
+class Placement(Strict):
     """Where a thing stands at time 0, before physics has settled it. Give either `on` or `pose`."""
 
     on: str | None = None
@@ -89,7 +53,7 @@ class Placement(_Strict):
         return self
 
 
-class SceneObject(_Strict):
+class SceneObject(Strict):
     """One object of the scene."""
 
     model: Name
@@ -104,7 +68,7 @@ class SceneObject(_Strict):
         return self.name or self.model
 
 
-class Static(_Strict):
+class Static(Strict):
     """What builds the static world."""
 
     builder: Literal["lab_room", "office_floor"]
@@ -114,7 +78,7 @@ class Static(_Strict):
     """Fixes the building; by default it follows the run's seed."""
 
 
-class StartPose(_Strict):
+class StartPose(Strict):
     """Start at a given place on the floor."""
 
     x: float
@@ -122,7 +86,7 @@ class StartPose(_Strict):
     yaw: float = 0.0
 
 
-class StartFacing(_Strict):
+class StartFacing(Strict):
     """Start in front of a piece of furniture, looking at it."""
 
     facing: str
@@ -134,13 +98,13 @@ class StartFacing(_Strict):
     """Radians off the direction that faces it."""
 
 
-class StartRoom(_Strict):
+class StartRoom(Strict):
     """Start anywhere on the free floor of a room."""
 
     room: str
 
 
-class RobotSettings(_Strict):
+class RobotSettings(Strict):
     """The robot at time 0."""
 
     start: StartPose | StartFacing | StartRoom
@@ -149,7 +113,7 @@ class RobotSettings(_Strict):
     head_tilt: float = Field(default=-0.4, ge=-0.98, le=0.72)
 
 
-class Target(_Strict):
+class Target(Strict):
     """Where the hand puts something: on a support, or into a container."""
 
     on: str | None = None
@@ -166,14 +130,14 @@ class Target(_Strict):
         return self
 
 
-class Wait(_Strict):
+class Wait(Strict):
     """The hand stays where it is."""
 
     do: Literal["wait"]
     seconds: Range
 
 
-class Carry(_Strict):
+class Carry(Strict):
     """The hand picks an object from above, carries it, puts it down gently and lets go."""
 
     do: Literal["carry"]
@@ -189,7 +153,7 @@ class Carry(_Strict):
     """Largest tilt on the way, radians."""
 
 
-class Push(_Strict):
+class Push(Strict):
     """The hand pushes an object along its support by contact."""
 
     do: Literal["push"]
@@ -198,7 +162,7 @@ class Push(_Strict):
     speed: float = Field(default=0.15, gt=0.0, le=0.5)
 
 
-class Retreat(_Strict):
+class Retreat(Strict):
     """The hand goes back to its rest place."""
 
     do: Literal["retreat"]
@@ -207,7 +171,7 @@ class Retreat(_Strict):
 Action: TypeAlias = Annotated[Wait | Carry | Push | Retreat, Field(discriminator="do")]
 
 
-class HandSettings(_Strict):
+class HandSettings(Strict):
     """A scripted human hand; the script repeats, with new random targets, until the run ends."""
 
     rest: Vector
@@ -215,7 +179,7 @@ class HandSettings(_Strict):
     script: tuple[Action, ...] = Field(min_length=1, max_length=200)
 
 
-class SensorSettings(_Strict):
+class SensorSettings(Strict):
     """Sensors: presets and deviations from them. Each mapping holds fields of the configuration that it names."""
 
     depth: str = "xtion"
@@ -234,7 +198,7 @@ class SensorSettings(_Strict):
     """Fields of `CalibrationFaults`."""
 
 
-class SceneFile(_Strict):
+class SceneFile(Strict):
     """A whole scene."""
 
     name: Name
@@ -289,31 +253,6 @@ class SceneFile(_Strict):
                 yield action.to.into
 
 
-class _Loader(yaml.SafeLoader):
-    """Safe YAML without aliases (they can blow up exponentially) and without silently repeated keys."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.constructor.ConstructorError(
-                None, None, "aliases (*name) are not allowed here", self.peek_event().start_mark
-            )
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        if len(set(keys)) < len(keys):
-            twice = next(key for key in keys if keys.count(key) > 1)
-            raise yaml.constructor.ConstructorError(None, None, f"key '{twice}' occurs twice", node.start_mark)
-        return super().construct_mapping(node, deep)
-
-
-# As in YAML 1.2, only true and false are booleans: `on` is the name of a field here.
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in rules if first in "tTfF" or not tag.endswith(":bool")]
-    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-
-
 def scene_names() -> dict[str, Path]:
     """Name -> folder of every scene that can be found; a name found twice belongs to the earlier folder."""
     found: dict[str, Path] = {}
@@ -341,29 +280,12 @@ def load_scene(name_or_path: str | Path) -> SceneFile:
 
 def read_scene(path: Path) -> SceneFile:
     """Read and validate one scene file; raises `FileFormatError`."""
-    if path.stat().st_size > MAX_BYTES:
-        raise FileFormatError(path, "", f"larger than {MAX_BYTES} bytes, which no scene file is")
-    try:
-        document = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except yaml.MarkedYAMLError as error:
-        where = f"line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise FileFormatError(path, where, f"not valid YAML: {error.problem}") from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise FileFormatError(path, "", f"not valid YAML: {error}") from error
-    return parse_scene(document, path)
+    return parse_scene(read_document(path), path)
 
 
 def parse_scene(document: Any, path: Path) -> SceneFile:
     """Validate a scene given as plain data, as if read from `path`; raises `FileFormatError`."""
-    if not isinstance(document, dict):
-        raise FileFormatError(path, "", "a scene is a mapping with at least the fields name, static, robot")
-    try:
-        scene = SceneFile.model_validate(document)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(str(part) for part in first["loc"])
-        given = "" if isinstance(first["input"], dict) else f" (given: {first['input']!r:.80})"
-        raise FileFormatError(path, field, f"{first['msg']}{given}") from error
+    scene = validated(SceneFile, document, path, "scene")
     scene._path = path.resolve()
     _check_inside(scene)
     return scene

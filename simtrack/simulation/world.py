@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
 
 import numpy as np
 
@@ -188,8 +189,17 @@ def build_static(scene: SceneFile, seed: int) -> StaticWorld:
     return office_floor(rng, configured(OfficeFloorConfig, scene.static.config, scene, "static.config"))
 
 
-def configured(config: type, values: Mapping[str, object], scene: SceneFile, where: str, base: object = None):
-    """A configuration dataclass from a scene file's mapping; errors name the file, the field and what is allowed.
+class UserFile(Protocol):
+    """A file that a user wrote."""
+
+    @property
+    def path(self) -> Path:
+        """Where it was read from."""
+        ...
+
+
+def configured(config: type, values: Mapping[str, object], scene: UserFile, where: str, base: object = None):
+    """A configuration dataclass from a user file's mapping; errors name the file, the field and what is allowed.
 
     `base` is an instance whose fields hold unless the mapping says otherwise.
     """

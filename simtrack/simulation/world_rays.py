@@ -49,6 +49,16 @@ class WorldRays:
         self._face_albedos = self._face_colors.mean(axis=1, dtype=np.float32) / np.float32(255)
         self._face_offsets = np.array(self._offsets)
 
+    @property
+    def fixed(self) -> int | None:
+        """The instance of what is fixed in the world, None if nothing is; those of `moving` follow in their order."""
+        return 0 if self._first else None
+
+    def face_ids(self, instance: int) -> Int32:
+        """(F,), index into `World.names` of what each face of an instance belongs to."""
+        first = self._offsets[instance]
+        return self._face_ids[first : first + len(self.scene.mesh(instance).faces)]
+
     def place(self, data: "mujoco.MjData") -> None:
         """Move everything to where it is in `data`."""
         for number, instance in enumerate(self.moving, self._first):

@@ -110,8 +110,10 @@ def test_open_and_oversized_meshes_are_warned_of(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"part\.stl: is not closed"):
         model = load_folder(write_object(tmp_path, box))
     assert np.linalg.eigvalsh(model.inertia).min() > 0.0
-    with pytest.warns(UserWarning, match=r"100 m large; if it was drawn in millimetres, set 'scale: 0.001'"):
+    with pytest.warns(UserWarning, match=r"measures 100 x .* m; if it was drawn in millimetres, set 'scale: 0.001'"):
         load_folder(write_object(tmp_path, scale=1.0))
+    with pytest.warns(UserWarning, match=r"measures 0.0001 x .* m; if it was drawn in metres, leave 'scale' out"):
+        load_folder(write_object(tmp_path, scale=1e-6))
 
 
 @pytest.mark.parametrize(
