@@ -70,6 +70,16 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Float64:
     return exp_so3(np.array([0, 0, yaw])) @ exp_so3(np.array([0, pitch, 0])) @ exp_so3(np.array([roll, 0, 0]))
 
 
+def rpy_from_rotation(rotation: Float64) -> tuple[float, float, float]:
+    """Roll, pitch, yaw in radians of a (3, 3) rotation (see `rotation_from_rpy`); roll is 0 at 90 deg of pitch."""
+    cosine = float(np.hypot(rotation[0, 0], rotation[1, 0]))
+    pitch = float(np.arctan2(-rotation[2, 0], cosine))
+    if cosine < 1e-9:
+        return 0.0, pitch, float(np.arctan2(-rotation[0, 1], rotation[1, 1]))
+    roll = float(np.arctan2(rotation[2, 1], rotation[2, 2]))
+    return roll, pitch, float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
 def transform(rotation: Float64 | None = None, translation: Float64 | tuple[float, ...] | None = None) -> Float64:
     """(4, 4) transform from a (3, 3) rotation (identity if None) and a (3,) translation (zero if None)."""
     T = np.eye(4)
