@@ -20,7 +20,7 @@ from simtrack.geometry.meshes import Mesh, decimate
 from simtrack.objects.model import ObjectModel, Symmetries, SymmetryAxis
 
 _log = logging.getLogger("simtrack.cache")
-_UNUSABLE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
+UNUSABLE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
 """What a file may raise that is missing, damaged or of another version."""
 _SCALARS = ("name", "semantic_class", "mass", "friction", "diameter", "trackable", "description")
 _ARRAYS = ("centre_of_mass", "inertia", "extents", "keypoints")
@@ -49,12 +49,12 @@ def _makers() -> bytes:
 def cached_model(name: str, key: str, build: Callable[[], ObjectModel]) -> ObjectModel:
     """The model kept under `name` and `key`, else built and kept; a cache that cannot be used is no error."""
     path = paths.cache_dir() / "objects" / f"{name}-{key}.npz"
-    with suppress(*_UNUSABLE):
+    with suppress(*UNUSABLE):
         return _read(path)
     _log.info("building object models: %s", name)
     model = build()
     with suppress(OSError):
-        _write(path, _pack(model))
+        write_arrays(path, _pack(model))
     return model
 
 
@@ -65,12 +65,12 @@ def cached_decimation(name: str, mesh: Mesh, target_faces: int) -> Mesh:
     parts = [mesh.vertices, mesh.faces, *([] if mesh.face_colors is None else [mesh.face_colors])]
     key = digest(*(part.tobytes() for part in parts), str(target_faces).encode())
     path = paths.cache_dir() / "objects" / f"{name}-{target_faces}-{key}.npz"
-    with suppress(*_UNUSABLE), path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-        return _mesh(data, "mesh")
+    with suppress(*UNUSABLE), path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+        return read_mesh(data, "mesh")
     _log.info("simplifying object models: %s", name)
     mesh = decimate(mesh, target_faces)
     with suppress(OSError):
-        _write(path, _mesh_arrays("mesh", mesh))
+        write_arrays(path, mesh_arrays("mesh", mesh))
     return mesh
 
 
@@ -80,20 +80,22 @@ def _pack(model: ObjectModel) -> Mapping[str, Any]:
     arrays["discrete"] = model.symmetries.discrete
     arrays["axes"] = np.array([[a.axis, a.offset] for a in model.symmetries.axes]).reshape(-1, 2, 3)
     for label, mesh in [("mesh", model.mesh), ("visual", model.visual), *_numbered(model.collision)]:
-        arrays |= _mesh_arrays(label, mesh)
+        arrays |= mesh_arrays(label, mesh)
     return arrays
 
 
-def _mesh_arrays(label: str, mesh: Mesh) -> dict[str, np.ndarray]:
+def mesh_arrays(label: str, mesh: Mesh) -> dict[str, np.ndarray]:
+    """A mesh as named arrays, to be read by `read_mesh`."""
     arrays: dict[str, np.ndarray] = {f"{label}.vertices": mesh.vertices, f"{label}.faces": mesh.faces}
     return arrays if mesh.face_colors is None else {**arrays, f"{label}.colors": mesh.face_colors}
 
 
-def _mesh(data: Mapping[str, np.ndarray], label: str) -> Mesh:
+def read_mesh(data: Mapping[str, np.ndarray], label: str) -> Mesh:
+    """The mesh that `mesh_arrays` named `label`."""
     return Mesh(data[f"{label}.vertices"], data[f"{label}.faces"], data.get(f"{label}.colors"))
 
 
-def _write(path: Path, arrays: Mapping[str, Any]) -> None:
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write under another name, then rename: readers see all of the file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
@@ -114,9 +116,9 @@ def _read(path: Path) -> ObjectModel:
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
         parts = sum(1 for key in data.files if key.startswith("collision") and key.endswith(".faces"))
         return ObjectModel(
-            mesh=_mesh(data, "mesh"),
-            visual=_mesh(data, "visual"),
-            collision=tuple(_mesh(data, f"collision{i}") for i in range(parts)),
+            mesh=read_mesh(data, "mesh"),
+            visual=read_mesh(data, "visual"),
+            collision=tuple(read_mesh(data, f"collision{i}") for i in range(parts)),
             symmetries=Symmetries(data["discrete"], tuple(SymmetryAxis(axis, offset) for axis, offset in data["axes"])),
             **{k: data[k] for k in _ARRAYS},
             **json.loads(str(data["scalars"])),
