@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import simtrack
 from simtrack.cli import console
 from simtrack.cli.bench import bench
+from simtrack.cli.check import check
 from simtrack.cli.generate import generate
 from simtrack.cli.inspect import inspect
 from simtrack.cli.objects import objects
@@ -23,6 +24,7 @@ VERBS = {
     "generate": generate,
     "inspect": inspect,
     "validate": validate,
+    "check": check,
     "scenes": scenes,
     "objects": objects,
     "query": query,

@@ -58,12 +58,9 @@ class Shape:
         if self.mesh is not None:
             points = self.mesh.vertices
         else:
-            half = {
-                "box": lambda s: s,
-                "sphere": lambda s: 2.0 * s.repeat(3),
-                "cylinder": lambda s: s[[0, 0, 1]] * [2, 2, 1],
-            }
-            extents = half[self.kind](np.asarray(self.size))
+            size = self.size
+            x, y, z = (2.0 * size[0],) * 3 if self.kind == "sphere" else (2.0 * size[0], 2.0 * size[0], size[-1])
+            extents = np.array(size if self.kind == "box" else (x, y, z))
             points = 0.5 * extents * [[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]
         return points @ self.pose[:3, :3].T + self.pose[:3, 3]
 

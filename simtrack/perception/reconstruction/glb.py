@@ -16,6 +16,8 @@ T_GLTF_SCENE = transform(exp_so3(np.array([-0.5 * np.pi, 0.0, 0.0])))
 def write_glb(tree: BodyTree, path: Path) -> None:
     """Write the binary glTF 2.0 file. Bodies without a visual mesh show their collision shapes."""
     import trimesh
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
     scene = trimesh.Scene(base_frame=ROOT if ROOT not in tree.by_name else f"{ROOT}/gltf")
@@ -26,11 +28,10 @@ def write_glb(tree: BodyTree, path: Path) -> None:
         scene.graph.update(frame_to=body.name, frame_from=parent, matrix=matrix)
         for k, (color, part) in enumerate(_shown(body)):
             material = PBRMaterial(baseColorFactor=[*color, 255], metallicFactor=0.0, roughnessFactor=0.9)
-            visual = trimesh.visual.TextureVisuals(material=material)
+            visual = TextureVisuals(material=material)
             mesh = trimesh.Trimesh(part.vertices, part.faces, process=False, visual=visual)
             scene.add_geometry(mesh, f"{body.name}/{k}", f"{body.name}/{k}", parent_node_name=body.name)
-    data = trimesh.exchange.gltf.export_glb(scene)
-    path.write_bytes(data)
+    path.write_bytes(export_glb(scene))
 
 
 def _shown(body: Body) -> list:

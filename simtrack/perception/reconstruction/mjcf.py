@@ -62,7 +62,7 @@ def _component(world: Element, component: Component, meshes: MeshFiles) -> None:
 
 
 def _body(parent: Element, body: Body, T_parent_body: Float64, meshes: MeshFiles) -> Element:
-    element = SubElement(parent, "body", name=body.name, **_pose(T_parent_body))
+    element = SubElement(parent, "body", {"name": body.name, **_pose(T_parent_body)})
     if body.mass > 0.0:
         moments, T_body_principal = body.principal_inertia()
         inertial = {"mass": numbers([body.mass]), "diaginertia": numbers(moments)}
@@ -70,7 +70,7 @@ def _body(parent: Element, body: Body, T_parent_body: Float64, meshes: MeshFiles
     for k, file in enumerate(meshes.visual[body.name]):
         rgba = numbers([channel / 255.0 for channel in file.color] + [1.0])
         seen = {"group": SEEN, "contype": "0", "conaffinity": "0", "rgba": rgba}
-        SubElement(element, "geom", name=f"{body.name}/visual{k}", type="mesh", mesh=file.path, **seen)
+        SubElement(element, "geom", {"name": f"{body.name}/visual{k}", "type": "mesh", "mesh": file.path, **seen})
     for k, shape in enumerate(body.collision):
         geom = {"name": f"{body.name}/collision{k}", "group": COLLIDES, "friction": numbers([body.friction])}
         if shape.kind == "convex":
