@@ -134,7 +134,8 @@ def _manifold(mesh: Mesh) -> Any:
     """A solid of a closed mesh, or None if manifold3d cannot make one of it."""
     import manifold3d
 
-    data = manifold3d.Mesh64(vert_properties=mesh.vertices, tri_verts=mesh.faces.astype(np.uint64))
+    # it takes no read-only arrays
+    data = manifold3d.Mesh64(vert_properties=np.array(mesh.vertices), tri_verts=np.array(mesh.faces, np.uint64))
     data.merge()
     solid = manifold3d.Manifold(data)
     whole = solid.status() == manifold3d.Error.NoError and solid.volume() > 1e-12

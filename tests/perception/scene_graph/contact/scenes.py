@@ -11,7 +11,6 @@ from simtrack.geometry.meshes import (
     concatenate,
     cylinder_mesh,
     face_normals,
-    subdivide_to,
     transformed,
 )
 from simtrack.geometry.transforms import rotation_from_rpy, transform, transform_xyz_rpy
@@ -127,14 +126,15 @@ def _leaning(thickness: float, length: float, angle: float, at: tuple[float, flo
     return (at[0], at[1] - float(turned[:, 1].max()), -float(turned[:, 2].min())), (-angle, 0.0, 0.0)
 
 
-def dense(mesh: Mesh, side: float = 0.03) -> Mesh:
-    """Tessellated to about a face for every right triangle of `side` metres."""
-    from simtrack.geometry.meshes import area
+def dense(mesh: Mesh, side: float = 0.06) -> Mesh:
+    """Tessellated until no edge is longer than `side` metres."""
+    from trimesh.remesh import subdivide_to_size
 
-    return subdivide_to(mesh, int(min(20000, max(len(mesh.faces), 2.0 * area(mesh) / side**2))))
+    vertices, faces = subdivide_to_size(mesh.vertices, mesh.faces, side)[:2]
+    return Mesh(vertices, faces)
 
 
-def seen(room: Room, noise: float, rng: np.random.Generator, side: float = 0.03) -> Room:
+def seen(room: Room, noise: float, rng: np.random.Generator, side: float = 0.06) -> Room:
     """The faces that some camera sees, with noise on the vertices; entities of which too little is seen are dropped."""
     from simtrack.raycast import RayScene, TriangleMesh
 
@@ -149,11 +149,12 @@ def seen(room: Room, noise: float, rng: np.random.Generator, side: float = 0.03)
         for camera in CAMERAS:
             rays = centres + 1e-3 * normals - camera
             length = np.linalg.norm(rays, axis=1)
-            hits = scene.cast(np.broadcast_to(camera, rays.shape), rays / length[:, None])
-            visible |= (np.einsum("fd,fd->f", rays, normals) < 0.0) & (np.asarray(hits.ranges) > length - 2e-3)
+            hits = scene.cast_rays(np.tile(camera, (len(rays), 1)), rays / length[:, None])
+            visible |= (np.einsum("fd,fd->f", rays, normals) < 0.0) & (hits.distances > length - 2e-3)
         used, faces = np.unique(mesh.faces[visible], return_inverse=True)
         if len(used) < 20:
             continue
         vertices = mesh.vertices[used] + rng.normal(0.0, noise, (len(used), 3))
         entities.append(EntityMesh(entity.name, entity.semantic_class, Mesh(vertices, faces.reshape(-1, 3))))
+    scene.close()
     return Room(entities, room.parents)
