@@ -7,7 +7,7 @@ import numpy as np
 from simtrack.contracts import Bool, Float64
 from simtrack.geometry.meshes import Mesh, area, concatenate, face_areas, face_normals, sample_surface
 
-SAMPLES = 3000
+SAMPLES = 1500
 TOLERANCE = 0.03
 """Of the larger horizontal side: how far a turned surface may lie from itself, in the 98th percentile."""
 FACET = np.cos(np.radians(20.0))

@@ -1,11 +1,11 @@
 """Placing furniture on the free floor of a room without closing the ways between its doors."""
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
 from simtrack.contracts import Bool, Float64, Room
-from simtrack.simulation.building.furniture import Furniture
 
 CELL = 0.05
 """Metres."""
@@ -13,6 +13,15 @@ PASSAGE = 0.36
 """Metres: half the width of the ways that stay open (a base of 0.54 m diameter and 9 cm to either side)."""
 LANDING = 0.6
 """Metres from the wall at which a way through a door has to be reached."""
+
+
+class Piece(Protocol):
+    """What stands on the floor."""
+
+    @property
+    def extents(self) -> Float64:
+        """(3,), depth (from its front to its rear), width, height in metres."""
+        ...
 
 
 class FloorSpace:
@@ -70,7 +79,7 @@ class FloorSpace:
             return -1
         return int(np.count_nonzero(regions == found.pop()))
 
-    def put(self, piece: Furniture, x: float, y: float, yaw: float, *, gap: float = 0.03, on_way: bool = False) -> bool:
+    def put(self, piece: Piece, x: float, y: float, yaw: float, *, gap: float = 0.03, on_way: bool = False) -> bool:
         """Take up the floor below a piece if it is free and the ways stay open; says whether it was.
 
         `on_way` ones (open door leaves) may stand on the floor that is reserved in front of doors.
@@ -90,7 +99,7 @@ class FloorSpace:
 
     def put_at_wall(
         self,
-        piece: Furniture,
+        piece: Piece,
         rng: np.random.Generator,
         *,
         attempts: int = 24,
@@ -118,7 +127,7 @@ class FloorSpace:
         return None
 
     def put_anywhere(
-        self, piece: Furniture, rng: np.random.Generator, *, attempts: int = 24, square: bool = True
+        self, piece: Piece, rng: np.random.Generator, *, attempts: int = 24, square: bool = True
     ) -> tuple[float, float, float] | None:
         """Try random places; `square` ones stand about parallel to the walls. (x, y, yaw) of the first that is free."""
         low, high = self.room.polygon.min(axis=0), self.room.polygon.max(axis=0)

@@ -1,0 +1,1 @@
+"""Rooms from a seed: furnished, settled, and known to the last contact."""
