@@ -75,7 +75,7 @@ class SurfacePlane:
         return np.asarray(points) @ self.normal + self.offset
 
     def height_at(self, x: float, y: float) -> float:
-        """z of the plane above or below a point of the map; the plane must not be vertical."""
+        """Z of the plane above or below a point of the map; the plane must not be vertical."""
         return float(-(self.offset + self.normal[0] * x + self.normal[1] * y) / self.normal[2])
 
     def moved(self, T: Float64) -> "SurfacePlane":

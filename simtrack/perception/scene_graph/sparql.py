@@ -88,25 +88,31 @@ class TripleStore:
             self._entities[name] = state
 
     def _begin(self, stamp: int, relation: Relation) -> None:
-        node = _node(f"interval/{self._intervals}")
+        node = entity_iri(f"interval/{self._intervals}")
         self._intervals += 1
         self._open[relation] = node
-        subject, name, reference = _node(relation.subject), _node(relation.name), _node(relation.reference)
+        subject, name, reference = (
+            entity_iri(relation.subject),
+            entity_iri(relation.name),
+            entity_iri(relation.reference),
+        )
         self._store.extend(
             [
                 ox.Quad(subject, name, reference),
-                ox.Quad(node, _TYPE, _node("Interval")),
-                ox.Quad(node, _node("subject"), subject),
-                ox.Quad(node, _node("relation"), name),
-                ox.Quad(node, _node("reference"), reference),
-                ox.Quad(node, _node("begin"), ox.Literal(stamp)),
+                ox.Quad(node, _TYPE, entity_iri("Interval")),
+                ox.Quad(node, entity_iri("subject"), subject),
+                ox.Quad(node, entity_iri("relation"), name),
+                ox.Quad(node, entity_iri("reference"), reference),
+                ox.Quad(node, entity_iri("begin"), ox.Literal(stamp)),
             ]
         )
 
     def _end(self, stamp: int, relation: Relation) -> None:
         node = self._open.pop(relation)
-        self._store.add(ox.Quad(node, _node("end"), ox.Literal(stamp)))
-        self._store.remove(ox.Quad(_node(relation.subject), _node(relation.name), _node(relation.reference)))
+        self._store.add(ox.Quad(node, entity_iri("end"), ox.Literal(stamp)))
+        self._store.remove(
+            ox.Quad(entity_iri(relation.subject), entity_iri(relation.name), entity_iri(relation.reference))
+        )
 
     def query(self, text: str) -> SparqlResult:
         """Answer a SPARQL 1.1 query. SERVICE is refused: a query reads this store and nothing else.
@@ -129,7 +135,8 @@ class TripleStore:
             raise QueryError(f"SPARQL: {error}. Prefixes: {prefixes}. Relations: {', '.join(RELATIONS)}") from None
 
 
-def _node(name: str) -> ox.NamedNode:
+def entity_iri(name: str) -> ox.NamedNode:
+    """Node of an entity, relation or class of this name."""
     return ox.NamedNode(NAMESPACE + quote(name, safe="/-_.~"))
 
 
@@ -139,7 +146,7 @@ def _taxonomy(facts: "SceneFacts") -> Iterable[ox.Quad]:
     pairs = [(name, above) for name in sorted(classes) for above in facts.ancestors(name)[1:]]
     pairs += [(model, above) for model, own in facts.models.items() for above in facts.ancestors(own)]
     return [
-        ox.Quad(_node(class_iri(low)), _SUBCLASS, _node(class_iri(high)))
+        ox.Quad(entity_iri(class_iri(low)), _SUBCLASS, entity_iri(class_iri(high)))
         for low, high in pairs
         if class_iri(low) != class_iri(high)
     ]
@@ -147,14 +154,14 @@ def _taxonomy(facts: "SceneFacts") -> Iterable[ox.Quad]:
 
 def _entity_quads(facts: "SceneFacts", name: str, parent: str | None) -> frozenset[ox.Quad]:
     """Types, name and layer of an entity and what it stands on or in; `parent` is None if it does not exist now."""
-    node = _node(name)
+    node = entity_iri(name)
     class_name, semantic_class, layer = facts.known[name]
-    quads = {ox.Quad(node, _TYPE, _node(class_iri(c))) for c in (class_name, *facts.ancestors(semantic_class))}
-    quads.add(ox.Quad(node, _node("name"), ox.Literal(name)))
-    quads.add(ox.Quad(node, _node("layer"), ox.Literal(layer.value)))
-    quads.add(ox.Quad(node, _node("exists"), ox.Literal(parent is not None)))
+    quads = {ox.Quad(node, _TYPE, entity_iri(class_iri(c))) for c in (class_name, *facts.ancestors(semantic_class))}
+    quads.add(ox.Quad(node, entity_iri("name"), ox.Literal(name)))
+    quads.add(ox.Quad(node, entity_iri("layer"), ox.Literal(layer.value)))
+    quads.add(ox.Quad(node, entity_iri("exists"), ox.Literal(parent is not None)))
     if parent:
-        quads.add(ox.Quad(node, _node("parent"), _node(parent)))
+        quads.add(ox.Quad(node, entity_iri("parent"), entity_iri(parent)))
     return frozenset(quads)
 
 

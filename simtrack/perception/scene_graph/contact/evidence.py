@@ -196,7 +196,10 @@ class _Look:
         )
         x0, x1, y0, y1 = found
         local = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-        corners = np.where(np.isfinite(local), local, 0.0) @ np.array([[cosine, sine], [-sine, cosine]]) + self.child.bottom_centre[:2]
+        corners = (
+            np.where(np.isfinite(local), local, 0.0) @ np.array([[cosine, sine], [-sine, cosine]])
+            + self.child.bottom_centre[:2]
+        )
         share = max(x1 - x0, 0.0) * max(y1 - y0, 0.0) if x1 > x0 and y1 > y0 else 0.0
         return share / self.child.footprint, area / self.child.footprint, corners
 

@@ -82,7 +82,9 @@ def _doubts(choice: _Choice, body: Posed) -> Iterator[Finding]:
         message = "nothing below it, around it or beside it supports it; it became a child of the scene"
         yield Finding(FindingCode.UNSUPPORTED, support.child, message)
     elif not support.touching:
-        message = f"touches nothing that supports it; '{support.parent}' is the likeliest, {support.distance:.3f} m below"
+        message = (
+            f"touches nothing that supports it; '{support.parent}' is the likeliest, {support.distance:.3f} m below"
+        )
         yield Finding(FindingCode.SUPPORT_GUESSED, support.child, message)
 
 
@@ -109,7 +111,11 @@ def _choices(name: str, bodies: Mapping[str, Posed], evidence: Evidence, config:
         return [root]
     found = {parent: pair for parent in bodies if (pair := evidence.get((name, parent), NOTHING)) is not NOTHING}
     choices = _touching(name, child, found, evidence, config)
-    likely = [_on(name, p, pair, option, config, touching=False) for p, pair in found.items() for option in _below(pair, config)]
+    likely = [
+        _on(name, p, pair, option, config, touching=False)
+        for p, pair in found.items()
+        for option in _below(pair, config)
+    ]
     clearance = min((s.distance for s in likely), default=np.inf)
     for parent, pair in found.items():
         if pair.within is not None:

@@ -111,8 +111,13 @@ def furnished_room() -> Room:
     add("cup", "cup", cylinder_mesh(0.04, 0.1), "table", (-1.7, 1.0, 0.80))
     add("bowl", "bowl", bowl_mesh(), "table", (-1.3, 1.1, 0.75))
     add("egg-cup", "cup", cylinder_mesh(0.025, 0.09), "bowl", (-1.3, 1.1, 0.75 + 0.0095 + 0.045))
-    add("monitor", "monitor", boxes(((0.5, 0.03, 0.3), (0, 0, 0.25)), ((0.05, 0.03, 0.1), (0, 0, 0.05)),
-        ((0.25, 0.18, 0.01), (0, 0, 0.005))), "desk", (1.5, 0.6, 0.72))
+    add(
+        "monitor",
+        "monitor",
+        boxes(((0.5, 0.03, 0.3), (0, 0, 0.25)), ((0.05, 0.03, 0.1), (0, 0, 0.05)), ((0.25, 0.18, 0.01), (0, 0, 0.005))),
+        "desk",
+        (1.5, 0.6, 0.72),
+    )
     add("picture", "picture", box_mesh((0.6, 0.03, 0.4)), "wall", (-1.0, 2.985, 1.6))
     add("board", "board", box_mesh((0.5, 0.02, 1.2)), "floor", *_leaning(0.02, 1.2, 0.2, (2.3, 3.0)))
     return Room(entities, parents)
