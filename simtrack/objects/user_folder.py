@@ -210,7 +210,7 @@ def _build(specification: ObjectSpecification, mesh: Mesh, path: Path) -> Object
         semantic_class=specification.semantic_class,
         mesh=mesh,
         visual=meshes.decimate(mesh, MAX_VISUAL_FACES),
-        collision=_collision(specification.collision, mesh, path),
+        collision=convex_parts(specification.collision, mesh, path),
         mass=mass,
         friction=specification.friction,
         symmetries=_symmetries(specification, mesh.bounds.mean(axis=0)),
@@ -220,7 +220,8 @@ def _build(specification: ObjectSpecification, mesh: Mesh, path: Path) -> Object
     )
 
 
-def _collision(kind: str, mesh: Mesh, path: Path) -> list[Mesh]:
+def convex_parts(kind: str, mesh: Mesh, path: Path) -> list[Mesh]:
+    """Convex pieces that stand for a mesh in physics; `kind` as `ObjectSpecification.collision`, `path` for errors."""
     if kind == "box":
         return [meshes.transformed(meshes.box_mesh(mesh.extents), transform(translation=mesh.bounds.mean(axis=0)))]
     if kind == "convex-hull":

@@ -71,7 +71,7 @@ class SceneObject(Strict):
 class Static(Strict):
     """What builds the static world."""
 
-    builder: Literal["lab_room", "office_floor"]
+    builder: Literal["lab_room", "office_floor", "room"]
     config: dict[str, Any] = Field(default_factory=dict)
     """Fields of the builder's configuration."""
     seed: int | None = Field(default=None, ge=0)
@@ -263,7 +263,7 @@ def scene_names() -> dict[str, Path]:
 
 
 def load_scene(name_or_path: str | Path) -> SceneFile:
-    """Read a scene by name, or by the path of its folder or YAML file.
+    """Read a scene by name, or by the path of its folder or YAML file; ``NAME:SEED`` fixes the building's seed.
 
     Raises `UnknownNameError` with the known scenes, `FileFormatError` with file, field and what is allowed.
     """
@@ -273,9 +273,18 @@ def load_scene(name_or_path: str | Path) -> SceneFile:
     if len(path.parts) > 1 and (path / FILE_NAME).is_file():
         return read_scene(path / FILE_NAME)
     known = scene_names()
-    if str(name_or_path) not in known:
-        raise UnknownNameError("scene", str(name_or_path), known)
-    return read_scene(known[str(name_or_path)] / FILE_NAME)
+    name, colon, seed = str(name_or_path).partition(":")
+    if name not in known or (colon and not (seed.isascii() and seed.isdecimal() and len(seed) < 10)):
+        raise UnknownNameError("scene", str(name_or_path), [*known, "NAME:SEED with one of these and a whole number"])
+    scene = read_scene(known[name] / FILE_NAME)
+    return scene if not colon else with_building_seed(scene, int(seed))
+
+
+def with_building_seed(scene: SceneFile, seed: int) -> SceneFile:
+    """The same scene with the building of a fixed seed."""
+    fixed = scene.model_copy(update={"static": scene.static.model_copy(update={"seed": seed})})
+    fixed._path = scene.path
+    return fixed
 
 
 def read_scene(path: Path) -> SceneFile:

@@ -179,7 +179,12 @@ def build_world(scene: SceneFile, seed: int, fovy: float = 0.79, image_size: tup
 
 def build_static(scene: SceneFile, seed: int) -> StaticWorld:
     """The building of a scene; raises FileFormatError for a configuration that its builder does not take."""
-    rng = stream(seed if scene.static.seed is None else scene.static.seed, "building")
+    building_seed = seed if scene.static.seed is None else scene.static.seed
+    if scene.static.builder == "room":
+        from simtrack.simulation.building.rooms.static import RoomConfig, room_world
+
+        return room_world(building_seed, configured(RoomConfig, scene.static.config, scene, "static.config"))
+    rng = stream(building_seed, "building")
     if scene.static.builder == "lab_room":
         from simtrack.simulation.building.lab_room import LabRoomConfig, lab_room
 

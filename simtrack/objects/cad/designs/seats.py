@@ -199,9 +199,9 @@ def chaise() -> ModelBuilder:
     p.block((-x, y - 0.22, 0.25), (x, y, 0.78), FOAM)
     p.block((x - 0.18, -y, 0.25), (x, y - 0.22, 0.58), FOAM)
     p.add(rounded_plate((0.85, 1.32, 0.19), 0.05, chamfer=0.02).at(-x + 0.425, -0.435, 0.249), FOAM)
-    b.support(p, (-x + 0.43, -0.4, 0.44), (0.6, 1.0))
+    b.support(p, (-x + 0.43, -0.4, 0.439), (0.6, 1.0))
     p.add(rounded_plate((1.36, 0.67, 0.19), 0.05, chamfer=0.02).at(0.335, -0.115, 0.249), FOAM)
-    b.support(p, (0.33, -0.15, 0.44), (1.1, 0.45))
+    b.support(p, (0.33, -0.15, 0.439), (1.1, 0.45))
     return b
 
 

@@ -1,0 +1,95 @@
+"""Rooms: the same from the same seed, at rest, every thing supported, families apart from the catalogue's."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from simtrack.objects.cad import cad_models
+from simtrack.simulation.building.rooms.evaluation import evaluation_rooms
+from simtrack.simulation.building.rooms.families import FAMILIES
+from simtrack.simulation.building.rooms.physics import FLOOR, WALLS, SettledRoom, compiled, settled_room
+from simtrack.simulation.building.rooms.plan import plan_room
+from simtrack.simulation.building.rooms.walk import WalkConfig, partial_entities
+
+
+@cache
+def room() -> SettledRoom:
+    return settled_room(1)
+
+
+def test_a_seed_gives_one_room() -> None:
+    a, b, other = plan_room(4), plan_room(4), plan_room(5)
+    assert [thing.name for thing in a.placed] == [thing.name for thing in b.placed]
+    for first, second in zip(a.placed, b.placed, strict=True):
+        assert np.array_equal(first.T_map_model, second.T_map_model)
+        assert first.positions == second.positions
+        assert np.array_equal(first.model.mesh().vertices, second.model.mesh().vertices)
+    assert len(other.placed) != len(a.placed) or not np.array_equal(
+        a.placed[0].T_map_model, other.placed[0].T_map_model
+    )
+
+
+def test_every_thing_stands_on_something_and_the_support_leads_to_the_floor() -> None:
+    carriers: dict[str, set[str]] = {}
+    for carried, carrier in room().supports:
+        carriers.setdefault(carried, set()).add(carrier)
+    things = [entity.name for entity in room().entities if entity.placed is not None]
+    assert len(things) >= 15
+    for name in things:
+        seen, front = set(), {name}
+        while front:
+            seen |= front
+            front = set().union(*(carriers.get(each, set()) for each in front)) - seen
+        assert FLOOR in seen, name
+
+
+def test_a_settled_room_stays_at_rest() -> None:
+    import mujoco
+
+    model, data = compiled(room().plan)
+    mujoco.mj_step(model, data, nstep=500)
+    for thing in room().plan.placed:
+        body = data.body(thing.name)
+        assert np.linalg.norm(body.xpos - thing.T_map_model[:3, 3]) < 0.01, thing.name
+        assert body.xmat.reshape(3, 3)[2] @ thing.T_map_model[:3, 2] > np.cos(0.02), thing.name
+
+
+def test_entities_stay_inside_and_above_the_floor() -> None:
+    low, high = room().plan.room.polygon.min(axis=0), room().plan.room.polygon.max(axis=0)
+    for entity in room().entities:
+        if entity.placed is not None:
+            bounds = entity.mesh.bounds
+            assert bounds[0, 2] > -0.005, entity.name
+            assert (bounds[0, :2] > low - 0.01).all() and (bounds[1, :2] < high + 0.01).all(), entity.name
+    assert {FLOOR, *WALLS} <= {entity.name for entity in room().entities}
+
+
+@pytest.mark.parametrize("family", sorted(FAMILIES))
+def test_families_are_apart_from_the_catalogue(family: str) -> None:
+    model = FAMILIES[family](np.random.default_rng(7)).finish(family)
+    for other in cad_models(model.semantic_class):
+        alike = np.allclose(model.extents, other.extents, rtol=0.02)
+        same_build = [len(p.convex) for p in model.parts] == [len(p.convex) for p in other.parts]
+        assert not (alike and same_build), other.name
+
+
+def test_a_walk_sees_parts_of_the_surface_near_where_it_is() -> None:
+    config = WalkConfig(frames=8, edge=0.08)
+    seen = partial_entities(room(), np.random.default_rng(0), config)
+    assert [entity.name for entity in seen] == [entity.name for entity in room().entities]
+    shares = np.array([entity.seen for entity in seen])
+    assert (shares >= 0.0).all() and (shares <= 1.0 + 1e-9).all()
+    assert (shares > 0.1).sum() >= 10
+    assert (shares[5:] < 0.95).all(), "undersides are never seen"
+    for whole, part in zip(room().entities, seen, strict=True):
+        if len(part.mesh.faces):
+            assert (part.mesh.bounds[0] > whole.mesh.bounds[0] - 0.15).all()
+            assert (part.mesh.bounds[1] < whole.mesh.bounds[1] + 0.15).all()
+    again = partial_entities(room(), np.random.default_rng(0), config)
+    assert all(np.array_equal(a.mesh.vertices, b.mesh.vertices) for a, b in zip(seen, again, strict=True))
+
+
+def test_evaluation_rooms_are_twenty_seeds() -> None:
+    rooms = evaluation_rooms()
+    assert len(rooms) == len(set(rooms)) == 20
