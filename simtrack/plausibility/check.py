@@ -7,9 +7,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeAlias
 
 import simtrack
 from simtrack.errors import InvalidValueError, UnknownNameError
@@ -29,6 +30,10 @@ TIME_LIMIT = 300.0
 """Seconds that an engine may take."""
 LOG_TAIL = 300
 """Characters of what an engine printed that are repeated when it died."""
+
+
+Answer: TypeAlias = tuple[list[Finding], EngineResult | None]
+"""What a child found in the file, and what its engine says of it; None if it could not run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +85,7 @@ def check_urdf(
         ]
         deadline = time.monotonic() + time_limit
         answers = [_answer(child, deadline, time_limit) for child in children]
-    report = _report(Path(path), answers, config)
+    report = judge(Path(path), answers, config)
     if folder is not None:
         document = {"verdict": report.verdict, **asdict(report)}
         (folder / "check.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
@@ -110,12 +115,13 @@ def _start(
         env={**os.environ, "PYTHONPATH": search},
     )
     assert process.stdin is not None
-    process.stdin.write(json.dumps(job).encode())
-    process.stdin.close()
+    with suppress(BrokenPipeError):  # it has died already; `_answer` says so
+        process.stdin.write(json.dumps(job).encode())
+        process.stdin.close()
     return _Child(engine, process, work, log)
 
 
-def _answer(child: _Child, deadline: float, time_limit: float) -> tuple[list[Finding], EngineResult | None]:
+def _answer(child: _Child, deadline: float, time_limit: float) -> Answer:
     try:
         code = child.process.wait(max(0.0, deadline - time.monotonic()))
     except subprocess.TimeoutExpired:
@@ -127,9 +133,7 @@ def _answer(child: _Child, deadline: float, time_limit: float) -> tuple[list[Fin
         child.log.close()
     result = child.work / "result.json"
     if result.is_file():
-        document: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
-        engine = document["engine"]
-        return [Finding(**row) for row in document["findings"]], None if engine is None else result_from_json(engine)
+        return answer_of(json.loads(result.read_text(encoding="utf-8")))
     stage = child.work / "stage"
     doing = stage.read_text(encoding="utf-8") if stage.is_file() else "starting"
     if code is None:
@@ -142,9 +146,14 @@ def _answer(child: _Child, deadline: float, time_limit: float) -> tuple[list[Fin
     return [Finding("unreadable", "crash", child.engine, f"died of {died} ({doing}): {tail}")], None
 
 
-def _report(
-    path: Path, answers: Sequence[tuple[list[Finding], EngineResult | None]], config: CheckConfig
-) -> CheckReport:
+def answer_of(document: dict[str, Any]) -> Answer:
+    """What a child found (the result of `simtrack.plausibility.child.run`)."""
+    engine = document["engine"]
+    return [Finding(**row) for row in document["findings"]], None if engine is None else result_from_json(engine)
+
+
+def judge(path: Path, answers: Sequence[Answer], config: CheckConfig) -> CheckReport:
+    """The verdict that follows from the answers of the engines, the deciding one first."""
     results = tuple(result for _, result in answers if result is not None)
     first = answers[0][1]
     findings: list[Finding] = []
