@@ -1,4 +1,4 @@
-"""How far a contact graph is from the true one: graph edit distance, as the reconstruction paper counts it and in general.
+"""How far a contact graph is from the true one: graph edit distance, as the reconstruction paper counts it and general.
 
 Definitions
 -----------

@@ -181,6 +181,6 @@ def _inliers(
 def _faces_on(
     mesh: Mesh, normals: Float64, normal: Float64, offset: float, limit: float, free: Bool
 ) -> npt.NDArray[np.int64]:
-    """Faces, none of them taken by another plane, that lie within `limit` of a plane and face its way, noise allowed."""
+    """Faces, not taken by another plane, that lie within `limit` of a plane and face its way, noise allowed."""
     near = np.abs(mesh.vertices @ normal + offset) <= limit
     return np.flatnonzero(free & near[mesh.faces].all(axis=1) & (normals @ normal > 0.5))

@@ -30,7 +30,7 @@ class ContactConfig:
     contact_area: float = 0.5
     """b_th of Eq. 2."""
     weak_area: float = 0.2
-    """Share of the bottom from which contact is accepted where none reaches `contact_area` (the public code's score)."""
+    """Share of the bottom from which contact is accepted where none reaches `contact_area` (public code: score 0.2)."""
     contact_gap: float = 0.03
     """Distance between bottom and plane up to which they touch: noise of both surfaces."""
     sink: float = 0.05

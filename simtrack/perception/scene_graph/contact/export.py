@@ -1,7 +1,7 @@
 """A contact graph in formats of others: GraphML, RDF (N-Triples, Turtle, ...) and Spark-DSG's JSON.
 
-Spark-DSG: the scene-graph library of MIT SPARK (Hydra, Khronos). Its layers hold the scene as a room, layout and objects
-as objects; support runs within and between layers as edges whose metadata say what they are.
+Spark-DSG: the scene-graph library of MIT SPARK (Hydra, Khronos). Its layers hold the scene as a room, layout and
+objects as objects; support runs within and between layers as edges whose metadata say what they are.
 """
 
 import json
@@ -68,7 +68,7 @@ def _yaw(node: EntityNode) -> float:
 def to_rdf(graph: ContactGraph, format_name: str = "nt") -> str:
     """RDF text in the scene graph's namespace: ``:cup a :Cup ; :on :table ; :parent :table``.
 
-    Relations are ``on``, ``in``, ``hangs-on``, ``leans-on`` and ``proximal``; proximal ones are given in both directions.
+    Relations are ``on``, ``in``, ``hangs-on``, ``leans-on`` and ``proximal``; the last are given in both directions.
 
     Args:
         graph: the graph.

@@ -173,7 +173,7 @@ def _direct(pair: PairEvidence) -> Iterator[SupportOption]:
 
 
 def _rests(upper: str, lower: str, evidence: Evidence, config: ContactConfig) -> bool:
-    """Whether one body is seated on another, and not the other on it: thin things lie between, and hide what is below."""
+    """Whether one body is seated on another, and not the other on it: what lies between hides what is below."""
 
     def seated(child: str, parent: str) -> bool:
         options = _direct(evidence.get((child, parent), NOTHING))

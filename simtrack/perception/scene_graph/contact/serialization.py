@@ -192,7 +192,7 @@ def _node(node: _Node, field: str, source: str | Path) -> EntityNode:
 
 
 def _support(support: _Support) -> Support:
-    fields = support.model_dump()
+    fields: dict[str, Any] = support.model_dump()
     missing = {name: np.nan for name in ("height", "distance") if fields[name] is None}
     return Support(**(fields | missing))
 

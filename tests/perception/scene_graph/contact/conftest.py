@@ -1,4 +1,4 @@
-"""The furnished room of `scenes.py`, built once."""
+"""The furnished room of `small_rooms.py`, built once."""
 
 import sys
 from pathlib import Path
@@ -8,17 +8,18 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import scenes
+import small_rooms
+
 from simtrack.perception.scene_graph.contact import ContactGraph, EntityNode, build_contact_graph, entity_nodes
 
 
 @pytest.fixture(scope="session")
-def room() -> scenes.Room:
-    return scenes.furnished_room()
+def room() -> small_rooms.Room:
+    return small_rooms.furnished_room()
 
 
 @pytest.fixture(scope="session")
-def nodes(room: scenes.Room) -> list[EntityNode]:
+def nodes(room: small_rooms.Room) -> list[EntityNode]:
     found, findings = entity_nodes(room.entities, np.random.default_rng(0))
     assert findings == []
     return found

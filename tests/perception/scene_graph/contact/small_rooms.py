@@ -77,13 +77,15 @@ def bowl_mesh(radius: float = 0.09, height: float = 0.07, wall: float = 0.005, s
     faces.append(np.stack([np.full(segments, n * segments), j, i], 1))
     last = (n - 1) * segments
     faces.append(np.stack([np.full(segments, n * segments + 1), last + i, last + j], 1))
-    return Mesh(vertices, np.concatenate(faces))
+    return Mesh(vertices, np.concatenate(faces).astype(np.int32))
 
 
 def plate(width: float, depth: float) -> Mesh:
     """A sheet of two faces that face up."""
     x, y = 0.5 * width, 0.5 * depth
-    return Mesh(np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    return Mesh(
+        np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    )
 
 
 def furnished_room() -> Room:
@@ -136,7 +138,7 @@ def dense(mesh: Mesh, side: float = 0.06) -> Mesh:
     from trimesh.remesh import subdivide_to_size
 
     vertices, faces = subdivide_to_size(mesh.vertices, mesh.faces, side)[:2]
-    return Mesh(vertices, faces)
+    return Mesh(vertices, np.asarray(faces, np.int32))
 
 
 def seen(room: Room, noise: float, rng: np.random.Generator, side: float = 0.06) -> Room:
@@ -160,6 +162,8 @@ def seen(room: Room, noise: float, rng: np.random.Generator, side: float = 0.06)
         if len(used) < 20:
             continue
         vertices = mesh.vertices[used] + rng.normal(0.0, noise, (len(used), 3))
-        entities.append(EntityMesh(entity.name, entity.semantic_class, Mesh(vertices, faces.reshape(-1, 3))))
+        entities.append(
+            EntityMesh(entity.name, entity.semantic_class, Mesh(vertices, faces.reshape(-1, 3).astype(np.int32)))
+        )
     scene.close()
     return Room(entities, room.parents)

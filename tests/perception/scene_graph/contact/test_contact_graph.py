@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
+import small_rooms
 
-import scenes
 from simtrack.errors import InvalidValueError, UnknownNameError
 from simtrack.geometry.meshes import Mesh, box_mesh, cylinder_mesh
 from simtrack.geometry.transforms import transform, transform_planar, transform_xyz_rpy
@@ -31,7 +31,7 @@ def at(name: str, kind: str, mesh: Mesh, *xyz: float, rpy: tuple[float, float, f
     return EntityMesh(name, kind, mesh, transform_xyz_rpy((xyz[0], xyz[1], xyz[2]), rpy))
 
 
-FLOOR = at("floor", "floor", scenes.plate(6.0, 6.0), 0, 0, 0)
+FLOOR = at("floor", "floor", small_rooms.plate(6.0, 6.0), 0, 0, 0)
 
 
 def tree(graph: ContactGraph) -> dict[str, str]:
@@ -46,7 +46,7 @@ def assert_feasible(graph: ContactGraph) -> None:
     assert sorted(graph.descendants()) == sorted(graph.nodes)
 
 
-def test_a_complete_room_is_understood(room: scenes.Room, graph: ContactGraph) -> None:
+def test_a_complete_room_is_understood(room: small_rooms.Room, graph: ContactGraph) -> None:
     assert tree(graph) == room.parents
     assert_feasible(graph)
     assert graph.supports["egg-cup"].kind is SupportKind.INSIDE
@@ -57,8 +57,8 @@ def test_a_complete_room_is_understood(room: scenes.Room, graph: ContactGraph) -
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.003, 0.005])
-def test_a_room_seen_in_part_with_noise_is_understood(room: scenes.Room, noise: float) -> None:
-    partial = scenes.seen(room, noise, np.random.default_rng(1))
+def test_a_room_seen_in_part_with_noise_is_understood(room: small_rooms.Room, noise: float) -> None:
+    partial = small_rooms.seen(room, noise, np.random.default_rng(1))
     graph = built(*partial.entities)
     assert tree(graph) == {entity.name: room.parents[entity.name] for entity in partial.entities}
     assert_feasible(graph)
@@ -122,7 +122,7 @@ def test_a_plank_across_two_boxes_is_held_by_both() -> None:
 
 
 def test_a_table_top_that_nobody_saw_becomes_a_hidden_plane() -> None:
-    table = scenes.table_mesh()
+    table = small_rooms.table_mesh()
     legs = Mesh(table.vertices, table.faces[12:])  # the top, and with it the plane, is missing
     books = [at(f"book{i}", "book", box_mesh((0.5, 0.7, 0.06)), x, 0, 0.755) for i, x in enumerate((-0.28, 0.28))]
     graph = built(FLOOR, at("table", "table", legs, 0, 0, 0), *books)
@@ -143,9 +143,9 @@ def test_a_box_is_stretched_down_to_its_support() -> None:
 
 
 def test_a_cup_under_a_table_stands_on_the_floor_and_a_lamp_hangs_from_the_ceiling() -> None:
-    table = at("table", "table", scenes.table_mesh(), 0, 0, 0)
+    table = at("table", "table", small_rooms.table_mesh(), 0, 0, 0)
     cup = at("cup", "cup", cylinder_mesh(0.04, 0.1), 0.1, 0, 0.05)
-    ceiling = at("ceiling", "ceiling", scenes.plate(6, 6), 0, 0, 2.5, rpy=(np.pi, 0, 0))
+    ceiling = at("ceiling", "ceiling", small_rooms.plate(6, 6), 0, 0, 2.5, rpy=(np.pi, 0, 0))
     lamp = at("lamp", "lamp", cylinder_mesh(0.15, 0.3), 1.5, 1.5, 2.35)
     graph = built(FLOOR, table, cup, ceiling, lamp)
     assert tree(graph) | {"ceiling": "", "floor": ""} == tree(graph)
