@@ -6,8 +6,8 @@
       chair/kitchen_chair.obj       a rigid model; any of `simtrack.geometry.meshes.MESH_SUFFIXES`
       fridge/larder.urdf            an articulated one; its meshes lie anywhere below ``my_models/``
 
-Metres, z up, the front towards -y. Meshes get convex parts by approximate convex decomposition (coacd), once: the result
-is kept in the disk cache under the content of the file.
+Metres, z up, the front towards -y. Meshes get convex parts by approximate convex decomposition (coacd), once: they
+are kept in the disk cache under the content of the file.
 """
 
 from collections.abc import Callable

@@ -132,7 +132,7 @@ def keyboard(
     split: bool = False,
     key: tuple[int, int, int] = (60, 62, 66),
 ) -> ModelBuilder:
-    """A keyboard of (width, depth) with a grid of keys; `slope` metres higher at the rear, `rest` metres for the wrists."""
+    """A keyboard of (width, depth) with a grid of keys, `slope` higher at the rear, with a `rest` for the wrists."""
     b = ModelBuilder("keyboard", description)
     p, x, y = b.part(), size[0] / 2, size[1] / 2
     outline = [(-y, 0.0), (y, 0.0), (y, height + slope), (-y, height)]

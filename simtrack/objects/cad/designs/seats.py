@@ -1,5 +1,7 @@
 """Chairs and sofas of the catalogue."""
 
+import itertools
+
 import numpy as np
 
 from simtrack.objects.cad.builder import ModelBuilder, PartBuilder
@@ -91,7 +93,7 @@ def shell_sled() -> ModelBuilder:
     for s in (-1, 1):
         at = s * 0.2
         points = [(at, -0.2, 0.4), (at, -0.23, 0.012), (at, 0.23, 0.012), (at, 0.18, 0.4)]
-        for u, v in zip(points, points[1:], strict=False):
+        for u, v in itertools.pairwise(points):
             bar(p, u, v, 0.011, STEEL)
     for y in (-0.19, 0.17):
         bar(p, (-0.2, y, 0.41), (0.2, y, 0.41), 0.011, STEEL)
@@ -108,7 +110,7 @@ def cantilever() -> ModelBuilder:
     for s in (-1, 1):
         at = s * 0.23
         points = [(at, 0.24, 0.014), (at, -0.24, 0.014), (at, -0.23, 0.44), (at, 0.2, 0.44), (at, 0.27, 0.85)]
-        for u, v in zip(points, points[1:], strict=False):
+        for u, v in itertools.pairwise(points):
             bar(p, u, v, 0.014, STEEL)
     bar(p, (-0.23, 0.24, 0.014), (0.23, 0.24, 0.014), 0.014, STEEL)
     p.block((-0.23, -0.22, 0.445), (0.23, 0.19, 0.465), LEATHER)

@@ -1,5 +1,7 @@
 """Books, boxes, bags and plants of the catalogue."""
 
+import itertools
+
 import numpy as np
 
 from simtrack.objects.cad.builder import ModelBuilder
@@ -88,7 +90,7 @@ def hollow_box(
     band: Material | None = None,
     grips: bool = False,
 ) -> ModelBuilder:
-    """A box of (width, depth, height); lid: ``none`` (open), ``closed``, ``hinged``, ``flaps`` (open, bent outwards)."""
+    """A box of (width, depth, height); lid: ``none`` (open), ``closed``, ``hinged``, ``flaps`` (open)."""
     b = ModelBuilder("box", description)
     p, x, y = b.part(), size[0] / 2, size[1] / 2
     h = size[2] - (wall + GAP if lid == "hinged" else wall if lid == "closed" else 0.0)
@@ -257,7 +259,7 @@ def sack() -> ModelBuilder:
     p = b.part()
     cloth = TEXTILE.painted((150, 120, 84))
     rings = [(0.13, 0.0), (0.17, 0.08), (0.16, 0.2), (0.05, 0.32), (0.03, 0.34)]
-    for (r0, z0), (r1, z1) in zip(rings, rings[1:], strict=False):
+    for (r0, z0), (r1, z1) in itertools.pairwise(rings):
         p.add(cylinder(r0, z1 - z0, top=r1, segments=20).at(z=z0), cloth)
     p.add(cylinder(0.03, 0.08, top=0.075, segments=20).at(z=0.34), cloth)
     b.handle(p, (-0.05, -0.05, 0.3), (0.05, 0.05, 0.38))

@@ -1,5 +1,7 @@
 """Cabinets, fridges and microwave ovens of the catalogue: things with doors and drawers."""
 
+import itertools
+
 import numpy as np
 
 from simtrack.objects.cad.builder import ModelBuilder
@@ -185,7 +187,7 @@ def fridge(
         levels = np.linspace(low, high, min(count, shelves) + 1).tolist()
         for z in levels[1:-1]:
             p.block((-x + wall, y0 + 0.06, z - 0.008), (x - wall, y1 - wall, z), GLASS)
-        for below, above in zip(levels, levels[1:], strict=False):
+        for below, above in itertools.pairwise(levels):
             b.hollow(p, (-x + wall, y0 + 0.06, below), (x - wall, y1 - wall, above - 0.008))
         pane = GLASS if window and k == len(bounds) - 1 else None
         tag = "door" if len(bounds) == 1 else f"door{k + 1}"

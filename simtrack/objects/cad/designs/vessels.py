@@ -1,5 +1,7 @@
 """Cups, bottles and bowls of the catalogue: solids of revolution, hollow in physics too."""
 
+import itertools
+
 import numpy as np
 
 from simtrack.objects.cad.builder import ModelBuilder, PartBuilder
@@ -25,7 +27,7 @@ def _staves(outer: Profile, wall: float, floor: float) -> list[Solid]:
             (0, 0, 0), *(cylinder(max(r, 1e-3), 1e-4, segments=2 * STAVES).at(z=min(z, floor - 1e-4)) for r, z in base)
         )
     )
-    for (r0, z0), (r1, z1) in zip(outer, outer[1:], strict=False):
+    for (r0, z0), (r1, z1) in itertools.pairwise(outer):
         if z1 <= floor + 1e-6 or z1 - z0 < 1e-6:
             continue
         z0, r0 = max(z0, floor), float(np.interp(max(z0, floor), *_columns(outer)))
@@ -106,12 +108,14 @@ CUPS = {
     "travel": lambda: cup(
         "travel cup with a lid", ((0.034, 0.0), (0.036, 0.09), (0.043, 0.17)), material=STEEL, handle="none", lid=True
     ),
-    "stein": lambda: cup("tall mug with a square handle", ((0.045, 0.0), (0.042, 0.07), (0.044, 0.14)), handle="square"),
+    "stein": lambda: cup(
+        "tall mug with a square handle", ((0.045, 0.0), (0.042, 0.07), (0.044, 0.14)), handle="square"
+    ),
     "barrel": lambda: cup("bellied mug", ((0.032, 0.0), (0.046, 0.03), (0.047, 0.05), (0.037, 0.088)), material=CLAY),
     "paper": lambda: cup(
         "paper cup", ((0.029, 0.0), (0.042, 0.108), (0.045, 0.112)), material=SHELL, handle="none", wall=0.0025
     ),
-}  # fmt: skip
+}
 """Name -> design."""
 
 
@@ -138,7 +142,7 @@ def bottle(
             (0, 0, 0),
             *(cylinder(r, 1e-4, segments=segments if square else 16).turned(yaw=turn).at(z=z) for r, z in pair),
         )
-        for pair in zip(outer, outer[1:], strict=False)
+        for pair in itertools.pairwise(outer)
         if pair[1][1] - pair[0][1] > 1e-6
     ]
     p.add(lathe(outline, segments=segments).turned(yaw=turn), glass, convex)
@@ -168,36 +172,61 @@ _GREEN = GLASS.painted((46, 92, 60))
 _CLEAR = SHELL.painted((196, 214, 226))
 BOTTLES = {
     "wine": lambda: bottle(
-        "wine bottle", ((0.036, 0.0), (0.037, 0.19), (0.015, 0.235), (0.014, 0.3)), _GREEN, cap=(0.0145, 0.008),
-        label=(0.06, 0.15), fill=0.6,
+        "wine bottle",
+        ((0.036, 0.0), (0.037, 0.19), (0.015, 0.235), (0.014, 0.3)),
+        _GREEN,
+        cap=(0.0145, 0.008),
+        label=(0.06, 0.15),
+        fill=0.6,
     ),
     "water": lambda: bottle(
-        "plastic water bottle", ((0.03, 0.0), (0.032, 0.09), (0.029, 0.1), (0.032, 0.11), (0.032, 0.17), (0.012, 0.215)),
-        _CLEAR, label=(0.12, 0.16),
+        "plastic water bottle",
+        ((0.03, 0.0), (0.032, 0.09), (0.029, 0.1), (0.032, 0.11), (0.032, 0.17), (0.012, 0.215)),
+        _CLEAR,
+        label=(0.12, 0.16),
     ),
     "square": lambda: bottle(
-        "square bottle", ((0.055, 0.0), (0.055, 0.15), (0.02, 0.17), (0.018, 0.2)), GLASS, cap=(0.02, 0.025), square=True
+        "square bottle",
+        ((0.055, 0.0), (0.055, 0.15), (0.02, 0.17), (0.018, 0.2)),
+        GLASS,
+        cap=(0.02, 0.025),
+        square=True,
     ),
     "jug": lambda: bottle(
-        "detergent jug with a grip", ((0.06, 0.0), (0.062, 0.17), (0.03, 0.23), (0.024, 0.245)),
-        PLASTIC.painted((52, 108, 176)), cap=(0.028, 0.03), grip=True, fill=0.5, label=(0.03, 0.12),
+        "detergent jug with a grip",
+        ((0.06, 0.0), (0.062, 0.17), (0.03, 0.23), (0.024, 0.245)),
+        PLASTIC.painted((52, 108, 176)),
+        cap=(0.028, 0.03),
+        grip=True,
+        fill=0.5,
+        label=(0.03, 0.12),
     ),
     "flask": lambda: bottle(
-        "steel flask", ((0.033, 0.0), (0.035, 0.006), (0.035, 0.2), (0.026, 0.22)), STEEL.painted((120, 150, 150)),
+        "steel flask",
+        ((0.033, 0.0), (0.035, 0.006), (0.035, 0.2), (0.026, 0.22)),
+        STEEL.painted((120, 150, 150)),
         cap=(0.026, 0.04),
     ),
     "beer": lambda: bottle(
-        "long-necked bottle", ((0.03, 0.0), (0.0305, 0.13), (0.014, 0.18), (0.012, 0.22)),
-        GLASS.painted((96, 60, 34)), cap=(0.0135, 0.006), label=(0.04, 0.1),
+        "long-necked bottle",
+        ((0.03, 0.0), (0.0305, 0.13), (0.014, 0.18), (0.012, 0.22)),
+        GLASS.painted((96, 60, 34)),
+        cap=(0.0135, 0.006),
+        label=(0.04, 0.1),
     ),
     "sauce": lambda: bottle(
-        "sauce bottle", ((0.03, 0.0), (0.034, 0.05), (0.024, 0.11), (0.026, 0.14), (0.012, 0.165)),
-        PLASTIC.painted((186, 46, 40)), cap=(0.013, 0.03),
+        "sauce bottle",
+        ((0.03, 0.0), (0.034, 0.05), (0.024, 0.11), (0.026, 0.14), (0.012, 0.165)),
+        PLASTIC.painted((186, 46, 40)),
+        cap=(0.013, 0.03),
     ),
     "carafe": lambda: bottle(
-        "bellied carafe", ((0.05, 0.0), (0.07, 0.04), (0.06, 0.09), (0.024, 0.15), (0.03, 0.23)), GLASS, cap=(0.024, 0.03)
+        "bellied carafe",
+        ((0.05, 0.0), (0.07, 0.04), (0.06, 0.09), (0.024, 0.15), (0.03, 0.23)),
+        GLASS,
+        cap=(0.024, 0.03),
     ),
-}  # fmt: skip
+}
 """Name -> design."""
 
 
@@ -225,12 +254,21 @@ def bowl(
 
 BOWLS = {
     "cereal": lambda: bowl("round cereal bowl", ((0.035, 0.0), (0.06, 0.02), (0.075, 0.06))),
-    "salad": lambda: bowl("wide wooden salad bowl", ((0.06, 0.0), (0.11, 0.03), (0.14, 0.09)), material=Material("wood", (168, 118, 72), 650.0, 0.5), wall=0.009),
-    "mixing": lambda: bowl("steel mixing bowl", ((0.05, 0.0), (0.09, 0.03), (0.11, 0.08), (0.12, 0.12)), material=STEEL, wall=0.003),
+    "salad": lambda: bowl(
+        "wide wooden salad bowl",
+        ((0.06, 0.0), (0.11, 0.03), (0.14, 0.09)),
+        material=Material("wood", (168, 118, 72), 650.0, 0.5),
+        wall=0.009,
+    ),
+    "mixing": lambda: bowl(
+        "steel mixing bowl", ((0.05, 0.0), (0.09, 0.03), (0.11, 0.08), (0.12, 0.12)), material=STEEL, wall=0.003
+    ),
     "soup": lambda: bowl("soup bowl with ears", ((0.04, 0.0), (0.058, 0.012), (0.062, 0.065)), ears=0.04),
     "pasta": lambda: bowl("flat pasta plate", ((0.05, 0.0), (0.075, 0.012), (0.09, 0.03), (0.13, 0.038))),
-    "footed": lambda: bowl("bowl on a foot", ((0.04, 0.0), (0.018, 0.014), (0.02, 0.02), (0.06, 0.04), (0.07, 0.075)), material=CLAY),
+    "footed": lambda: bowl(
+        "bowl on a foot", ((0.04, 0.0), (0.018, 0.014), (0.02, 0.02), (0.06, 0.04), (0.07, 0.075)), material=CLAY
+    ),
     "hexagonal": lambda: bowl("six-sided bowl", ((0.05, 0.0), (0.09, 0.05)), segments=6),
     "straight": lambda: bowl("straight-sided dish", ((0.085, 0.0), (0.09, 0.005), (0.09, 0.055)), material=GLASS),
-}  # fmt: skip
+}
 """Name -> design."""

@@ -3,6 +3,7 @@
 Legs are outside of tops or L-shaped, boards overlap, doors slide in from proportions that are drawn at random.
 """
 
+import itertools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
@@ -136,7 +137,7 @@ def cabinet(rng: np.random.Generator) -> ModelBuilder:
     b.support(p, (0.0, -0.01, h + 0.025), (2 * x, 2 * y))
     count = int(rng.integers(2, 5))
     edges = np.linspace(z + wall, h - wall, count + 1).tolist()
-    for k, (low, high) in enumerate(zip(edges, edges[1:], strict=False)):
+    for k, (low, high) in enumerate(itertools.pairwise(edges)):
         drawer(b, f"drawer{k + 1}", (-x + wall, split - wall / 2), (low, high), (-y, y - wall), wood, overlap=-0.001)
     shelf = (z + h) / 2
     p.block((split + wall / 2, -y + 0.02, shelf - 0.008), (x - wall, y - wall, shelf + 0.008), wood)
@@ -156,7 +157,7 @@ def fridge(rng: np.random.Generator) -> ModelBuilder:
     levels = [foot + wall, foot + wall + 0.22 * (h - foot), foot + wall + 0.55 * (h - foot), h - wall]
     for z in levels[1:-1]:
         p.block((-x + wall, y0 + 0.08, z - 0.012), (x - wall, y1 - wall, z), SHELL)
-    for low, high in zip(levels, levels[1:], strict=False):
+    for low, high in itertools.pairwise(levels):
         b.hollow(p, (-x + wall, y0 + 0.08, low), (x - wall, y1 - wall, high - 0.012))
     b.support(p, (0.0, (y0 + y1) / 2, h), (2 * x, y1 - y0))
     side = "left" if rng.random() < 0.5 else "right"
@@ -214,7 +215,7 @@ def bag(rng: np.random.Generator) -> ModelBuilder:
     p.add(rounded_plate((2 * x, 2 * y, 0.6 * h), 0.03), cloth)
     p.add(rounded_plate((1.7 * x, 1.5 * y, 0.4 * h), 0.03).at(z=0.6 * h - 0.002), cloth)
     points = [(-0.4 * x, 0.0, h - 0.01), (-0.4 * x, 0.0, h + 0.1), (0.4 * x, 0.0, h + 0.1), (0.4 * x, 0.0, h - 0.01)]
-    for a, c in zip(points, points[1:], strict=False):
+    for a, c in itertools.pairwise(points):
         bar(p, a, c, 0.009, cloth)
     b.handle(p, (-0.4 * x, -0.01, h + 0.09), (0.4 * x, 0.01, h + 0.11))
     return b
