@@ -92,10 +92,14 @@ class Posed:
         """(K, 3) faces on one of the node's planes."""
         return self.faces[self.node.planes[plane].faces]
 
+    def plane_outline(self, plane: int) -> Float64:
+        """(K, 3) corners of the convex hull of what lies on a plane."""
+        return apply(self.node.T_map_entity, self.shape.outlines[plane])
+
     def plane_hull(self, plane: int) -> tuple[Float64, Int32]:
         """Horizontal convex hull of a plane's faces, as vertices and faces at height 0."""
         if plane not in self._planes:
-            self._planes[plane] = _fan(horizontal_hull(self.vertices[np.unique(self.faces_of(plane))]))
+            self._planes[plane] = _fan(horizontal_hull(self.plane_outline(plane)))
         return self._planes[plane]
 
     @property
@@ -296,7 +300,7 @@ def _facing(child: Posed, parent: Posed, plane: int, depth: float) -> tuple[floa
     """Share of the child's side within an upright plane's extent, and the child's slenderness off it."""
     n = parent.node.planes[plane].normal
     across = np.array([-n[1], n[0], 0.0]) / np.hypot(n[0], n[1])
-    wall = parent.vertices[np.unique(parent.faces_of(plane))]
+    wall = parent.plane_outline(plane)
     own = np.stack([child.hull @ across, child.hull[:, 2]], axis=1)
     other = np.stack([wall @ across, wall[:, 2]], axis=1)
     size = np.maximum(np.ptp(own, axis=0), 1e-9)

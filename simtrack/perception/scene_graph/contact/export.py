@@ -108,7 +108,8 @@ def to_rdf(graph: ContactGraph, format_name: str = "nt") -> str:
     for edge in graph.proximal:
         add(edge.first, "proximal", edge.second, entity=True)
         add(edge.second, "proximal", edge.first, entity=True)
-    return ox.serialize(triples, format=syntax, prefixes=PREFIXES).decode()
+    data = ox.serialize(triples, format=syntax, prefixes=PREFIXES)
+    return data.decode() if data else ""
 
 
 def to_spark_dsg(graph: ContactGraph) -> str:
@@ -127,8 +128,8 @@ def to_spark_dsg(graph: ContactGraph) -> str:
         nodes.append({"attributes": attributes, "id": ids[name], "layer": _SPARK_LAYERS["OBJECTS"], "partition": 0})
     joined: dict[tuple[int, int], list[dict[str, Any]]] = {}
     for source, target, attributes in edges_of(graph):  # one edge a pair there: the first is the tree's
-        pair = ids[source], ids[target]
-        joined.setdefault(pair[::-1] if pair[::-1] in joined else pair, []).append(
+        pair, converse = (ids[source], ids[target]), (ids[target], ids[source])
+        joined.setdefault(converse if converse in joined else pair, []).append(
             attributes | {"source": source, "target": target}
         )
     edges = [

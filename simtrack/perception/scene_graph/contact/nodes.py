@@ -17,7 +17,7 @@ from simtrack.geometry.boxes import OrientedBox
 from simtrack.geometry.meshes import Mesh, convex_hull, face_areas, is_closed, mass_properties, validate, volume
 from simtrack.geometry.planes import PlaneConfig, SurfacePlane, detect_planes
 from simtrack.geometry.transforms import apply, is_rigid
-from simtrack.geometry.upright_boxes import upright_box
+from simtrack.geometry.upright_boxes import horizontal_hull, upright_box
 
 if TYPE_CHECKING:
     from simtrack.raycast import TriangleMesh
@@ -88,6 +88,8 @@ class EntityShape:
 
     mesh: Mesh
     planes: tuple[SurfacePlane, ...]
+    outlines: tuple[Float64, ...]
+    """(K, 3) corners of the convex hull of what lies on each plane."""
     hull: Float64
     """(K, 3), corners of the convex hull."""
     centre_of_mass: Float64
@@ -127,7 +129,17 @@ def entity_shape(
     else:
         weights = face_areas(mesh)
         centre = weights @ mesh.triangles.mean(axis=1) / weights.sum()
-    return EntityShape(mesh, planes, hull, centre, closed, TriangleMesh(mesh.vertices, mesh.faces, source), solid)
+    outlines = tuple(_outline(mesh, plane) for plane in planes)
+    return EntityShape(
+        mesh, planes, outlines, hull, centre, closed, TriangleMesh(mesh.vertices, mesh.faces, source), solid
+    )
+
+
+def _outline(mesh: Mesh, plane: SurfacePlane) -> Float64:
+    """(K, 3) convex hull, within the plane, of the faces that lie on it."""
+    points = mesh.vertices[np.unique(mesh.faces[plane.faces])]
+    axes = np.linalg.svd(plane.normal[None])[2][1:]
+    return horizontal_hull(points @ axes.T) @ axes - plane.offset * plane.normal
 
 
 def _manifold(mesh: Mesh) -> Any:

@@ -193,8 +193,9 @@ def _node(node: _Node, field: str, source: str | Path) -> EntityNode:
 
 def _support(support: _Support) -> Support:
     fields: dict[str, Any] = support.model_dump()
-    missing = {name: np.nan for name in ("height", "distance") if fields[name] is None}
-    return Support(**(fields | missing))
+    for name in ("height", "distance"):
+        fields[name] = np.nan if fields[name] is None else fields[name]
+    return Support(**fields)
 
 
 def _require_names(data: _Graph, nodes: dict[str, EntityNode], source: str | Path) -> None:
