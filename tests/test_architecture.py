@@ -108,7 +108,7 @@ def test_every_package_that_is_imported_is_a_declared_dependency() -> None:
     lines = [*project["dependencies"], *extras["viz"], *extras["bench"], *extras["distributed"]]
     declared = {re.split(r"[\[<>=~!; ]", line)[0] for line in lines}
     modules = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in declared} | {"simtrack"}
-    modules |= {"llvmlite", "markupsafe", "pydantic_core"}  # halves of numba, jinja2 and pydantic
+    modules |= {"llvmlite", "markupsafe", "pydantic_core", "pybullet_utils"}  # of numba, jinja2, pydantic, pybullet
     modules |= set(sys.stdlib_module_names)
     found = [(path, line, name.split(".")[0]) for path in MODULES for line, name in imported(path)]
     assert [f"{path}:{line}: {top}" for path, line, top in found if top not in modules] == []

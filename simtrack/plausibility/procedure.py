@@ -13,6 +13,8 @@ from simtrack.plausibility.verdict import BodyResult, CheckConfig, EngineResult,
 
 SEARCH = (0.02, 0.2, 2.0)
 """Metres in which something below a body is looked for, the next only if the one before finds nothing."""
+TOUCHING = 1e-5
+"""Metres below which bodies touch, and the direction between their nearest points says nothing."""
 GROUND = "ground"
 LAST = 0.25
 """Seconds at the end in which a body at rest moves less than `STILL`."""
@@ -118,7 +120,7 @@ def _gap(engine: Engine, part: Component, owner: dict[str, str]) -> float | None
                 continue
             up = pair.up if pair.body_a in own else -pair.up
             around = min(around, pair.distance)
-            if up > 0.1 or pair.distance <= 0.0:
+            if up > 0.1 or pair.distance < TOUCHING:
                 below = min(below, pair.distance)
         if np.isfinite(below):
             return max(0.0, below)
