@@ -125,7 +125,10 @@ def _choices(name: str, bodies: Mapping[str, Posed], evidence: Evidence, config:
     choices += [_Choice(_Rank.LIKELY, support) for support in likely]
     if not choices:
         choices += _onto_floor(name, bodies, found, config)
-    return [*sorted(choices, key=lambda choice: choice.key, reverse=True), root]
+    best: dict[str, _Choice] = {}  # one way a parent
+    for choice in sorted(choices, key=lambda choice: choice.key, reverse=True):
+        best.setdefault(choice.support.parent, choice)
+    return [*best.values(), root]
 
 
 def _on(
