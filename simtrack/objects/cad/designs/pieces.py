@@ -73,10 +73,12 @@ def door(
     grip: Span | None = None,
     grip_material: Material = STEEL,
     window: Material | None = None,
+    front_pin: bool = False,
 ) -> PartBuilder:
     """A door that lies before a carcass whose front edges are at y = `front`; its handle is a bar at the free edge.
 
     `grip` is the handle's span in z, by default the middle fifth; a `window` is let into the leaf.
+    A `front_pin` keeps the leaf within its own width as it turns: for a hinge beside another door.
     """
     leaf = b.part(name)
     x0, x1 = x[0] + GAP / 2, x[1] - GAP / 2
@@ -96,7 +98,8 @@ def door(
     b.handle(leaf, (at - 0.008, face - 0.032, low), (at + 0.008, face, high), grip_material)
     # A left hinge opens clockwise seen from above, a right one counter-clockwise: both swing the free edge to -y.
     edge, turn = (x0, -1.0) if hinge == "left" else (x1, 1.0)
-    b.joint("revolute", leaf, (edge, rear, (z0 + z1) / 2), (0.0, 0.0, turn), (0.0, limit), friction)
+    pin = face if front_pin else rear
+    b.joint("revolute", leaf, (edge, pin, (z0 + z1) / 2), (0.0, 0.0, turn), (0.0, limit), friction)
     return leaf
 
 

@@ -329,6 +329,8 @@ def counter(rng: np.random.Generator) -> ModelBuilder:
             "left" if k % 2 else "right",
             front,
             thickness=0.018,
+            front_pin=True,
+            limit=1.5,
         )
     return b
 
