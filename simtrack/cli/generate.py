@@ -44,6 +44,8 @@ def generate(
 
     if seed < 0:
         raise InvalidValueError("seed", seed, "0 or more")
+    if count is not None and count < 1:
+        raise InvalidValueError("count", count, "1 or more")
     if workers is not None and workers < 1:
         raise InvalidValueError("workers", workers, "1 or more")
     if address is not None and engine != "ray":

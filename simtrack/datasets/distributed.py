@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import simtrack
-from simtrack.datasets.folder import SceneMarker, scene_units, sync_file_system
+from simtrack.datasets.folder import SceneMarker, scene_units, sync_tree
 from simtrack.datasets.local import thread_limits
 from simtrack.datasets.scene_maker import Event, Failure, SceneFailed, SceneMaker, SceneReady, SourceFactory
 from simtrack.datasets.writer import DatasetWriter
@@ -166,7 +166,7 @@ class RayPool:
         found = SceneMarker.of(staging, marker.scene, marker.frames, scene_units(staging, marker.scene))
         if found != marker:
             return SceneFailed(marker.scene, Failure.DIED, "its archive arrived damaged")
-        sync_file_system(staging)
+        sync_tree(staging)
         return SceneReady(marker.scene, marker)
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from simtrack.datasets.estimate import expected_bytes_per_frame
+from simtrack.datasets.estimate import expected_bytes_per_frame, known_bytes_per_frame
 from simtrack.datasets.folder import SPACE_ERRORS, DatasetFolder, SceneMarker, remove
 from simtrack.datasets.local import LocalPool
 from simtrack.datasets.scene_maker import Event, Failure, FrameWritten, SceneFailed, SceneReady, SourceFactory
@@ -137,7 +137,7 @@ def generate(
                 for writer in writers:
                     writer.begin(out, info)
                 run = _Run(folder, lengths, done, report)
-                run.check_space(_known_size(done) or expected_bytes_per_frame(info, folder.formats))
+                run.check_space(known_bytes_per_frame(done.values()) or expected_bytes_per_frame(info, folder.formats))
                 make_pool = pool or local_pool(1)
                 if len(done) < scenes:
                     with closing(make_pool(factory, writers, folder.staging)) as workers:
@@ -224,7 +224,7 @@ class _Run:
                 del self._written[scene]
                 self._done[scene] = marker
                 if len(self._done) == 1:  # now sizes are known
-                    self.check_space(_known_size(self._done))
+                    self.check_space(known_bytes_per_frame(self._done.values()))
             case SceneFailed(scene, failure, message):
                 del self._written[scene]
                 remove(self._running.pop(scene))
@@ -266,12 +266,6 @@ def _check_extension(folder: DatasetFolder, done: dict[int, SceneMarker], length
                 folder.root,
                 f"scene {scene} has {marker.frames} frames there and would have {lengths[scene]}; name another folder",
             )
-
-
-def _known_size(done: dict[int, SceneMarker]) -> float:
-    """Bytes a frame of the scenes that are there, 0 without any."""
-    frames = sum(marker.frames for marker in done.values())
-    return sum(marker.bytes for marker in done.values()) / frames if frames else 0.0
 
 
 def _full(message: str) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from types import TracebackType
 from typing import Protocol
 
+from simtrack.datasets.content import ColorRenderer
 from simtrack.datasets.frame import Category, DatasetInfo, LabelledFrame, SceneInfo, StuffCategory
 from simtrack.datasets.recipe import DriveViews, Recipe
 
@@ -33,17 +34,18 @@ class Generator:
                 print(frame.key, [label.name for label in frame.targets()])
     """
 
-    def __init__(self, recipe: Recipe, seed: int) -> None:
+    def __init__(self, recipe: Recipe, seed: int, renderer: ColorRenderer | None = None) -> None:
         """Load what all scenes share.
 
         Args:
             recipe: from `load_recipe`.
             seed: of everything random.
+            renderer: of the colour images of settled scenes, instead of the one that the recipe names.
 
         Raises:
             FileFormatError: what the recipe names does not exist or cannot be used.
         """
-        self._source: _Source = _source(recipe, seed)
+        self._source: _Source = _source(recipe, seed, renderer)
         self.info = DatasetInfo(
             name=recipe.name,
             description=recipe.description,
@@ -86,11 +88,11 @@ class Generator:
         self.close()
 
 
-def _source(recipe: Recipe, seed: int) -> _Source:
+def _source(recipe: Recipe, seed: int, renderer: ColorRenderer | None) -> _Source:
     if isinstance(recipe.views, DriveViews):
         from simtrack.datasets.drives import Drives
 
         return Drives(recipe, seed)
     from simtrack.datasets.settled import SettledScenes
 
-    return SettledScenes(recipe, seed)
+    return SettledScenes(recipe, seed, renderer)

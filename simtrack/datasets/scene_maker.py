@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Protocol, TypeAlias
 
-from simtrack.datasets.folder import SPACE_ERRORS, SceneMarker, scene_units, sync_file_system
+from simtrack.datasets.folder import SPACE_ERRORS, SceneMarker, scene_units, sync_tree
 from simtrack.datasets.frame import DatasetInfo, LabelledFrame, SceneInfo
 from simtrack.datasets.writer import DatasetWriter
 from simtrack.errors import DatasetError, SimtrackError
@@ -120,5 +120,5 @@ class SceneMaker:
         if frames != about.frames:
             raise DatasetError(staging, f"scene {scene} was said to have {about.frames} frames and has {frames}")
         marker = SceneMarker.of(staging, scene, frames, scene_units(staging, scene))
-        sync_file_system(staging)
+        sync_tree(staging)
         yield SceneReady(scene, marker)

@@ -54,12 +54,13 @@ class _Scene:
 class SettledScenes:
     """What `simtrack.datasets.generator.Generator` makes of recipes with views of kind ``shell``."""
 
-    def __init__(self, recipe: Recipe, seed: int) -> None:
+    def __init__(self, recipe: Recipe, seed: int, renderer: ColorRenderer | None = None) -> None:
         """Load what all scenes share.
 
         Args:
             recipe: from `load_recipe`, with views of kind ``shell``.
             seed: of everything random.
+            renderer: instead of the one that the recipe names.
 
         Raises:
             FileFormatError: what the recipe names does not exist or cannot be used.
@@ -76,7 +77,7 @@ class SettledScenes:
         intrinsics = recipe.camera.intrinsics
         self._shell = CameraShell(recipe.views, intrinsics)
         self._annotator, self._relations = Annotator(intrinsics, FAR), Relations()
-        self._renderer = _renderer(recipe)
+        self._renderer = renderer or color_renderer(recipe)
         self._effects = Effects(recipe.effects, intrinsics, linear=recipe.renderer == "pyrender")
         self.stuff = tuple(self._stuff.values())
 
@@ -196,7 +197,8 @@ class SettledScenes:
         return stuff_categories(static, loose, len(self.categories))
 
 
-def _renderer(recipe: Recipe) -> ColorRenderer:
+def color_renderer(recipe: Recipe) -> ColorRenderer:
+    """The renderer that a recipe names."""
     intrinsics = recipe.camera.intrinsics
     if recipe.renderer == "mujoco":
         return MujocoColorRenderer(intrinsics, recipe.effects.antialiasing**2)

@@ -109,7 +109,8 @@ class _Stages:
     ) -> None:
         self._camera, self._noise, self._map, self._tables = log.sensor == "camera", log.noise, grown, tables
         self._first = self._last = first.frame.stamp
-        self._stated, self._status = first.T_map_sensor, "map"
+        self._stated = None if first.T_map_sensor is None else (first.frame.stamp, first.T_map_sensor)
+        self._status = "map"
         self._localizer = FreeLocalizer(grown.surface, first.frame.stamp, _start(first), config)
         self._clock, self._counts = Clock(), Counter[str](frames=1)
         self._located, self._placed, self._along = Residuals(), Residuals(), Residuals()
@@ -139,17 +140,17 @@ class _Stages:
                 T, self._status, placed = found.T_map_base, found.status.value, found.status in TRUSTED
                 row = self._judge(found, shots, stated)
                 if stated is not None and found.status is Status.LOST:
-                    self._localizer.restart(frame.stamp, stated)
+                    self._localizer.restart(frame.stamp, stated, before=self._stated)
             here = T if stated is None else stated
             if stated is not None or placed:
                 row |= self._compare(entry, shots, here)
                 self._take_objects(entry, here)
-        self._stated = stated if stated is not None else self._stated
+        self._stated = (frame.stamp, stated) if stated is not None else self._stated
         self._tables.add(frame.stamp, self._status, T, row | {"map_faces": self._map.faces})
 
     def _has_jumped(self, stated: Float64 | None) -> bool:
         """Whether the sensor is said to have moved further since the last stated pose than a localizer can follow."""
-        return stated is not None and self._stated is not None and not self._localizer.follows(self._stated, stated)
+        return stated is not None and self._stated is not None and not self._localizer.follows(self._stated[1], stated)
 
     def _judge(self, found: Localization, shots: Measurement, stated: Float64 | None) -> dict[str, float]:
         """The estimate beside the map, and beside the stated pose."""

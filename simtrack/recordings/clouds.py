@@ -32,6 +32,7 @@ def open_kitti(folder: Path) -> SensorLog:
     Beside the scans' folder may stand ``times.txt`` (seconds, one a line) or KITTI raw's ``timestamps.txt``, and
     ``poses.txt`` (12 numbers a line, T_world_camera of the left camera, with ``calib.txt`` naming ``Tr``; or, without
     ``calib.txt``, those of the lidar itself). Poses of the odometry benchmark are found in its ``poses/00.txt``, too.
+    The format has no times of single shots: a scan is taken as if all of it were measured at its stamp.
     """
     scans = folder
     for name in ("velodyne", "velodyne_points/data", "data"):

@@ -97,9 +97,7 @@ def test_the_robot_carries_the_camera_and_the_lidar(frames: list[LabelledFrame])
         assert 0.2 < (inverse(frames[0].T_map_base) @ lidar.T_map_lidar)[2, 3] < 2.0  # type: ignore[arg-type]
 
 
-def test_a_drive_repeats_to_the_byte_whatever_came_before(
-    generator: Generator, frames: list[LabelledFrame]
-) -> None:
+def test_a_drive_repeats_to_the_byte_whatever_came_before(generator: Generator, frames: list[LabelledFrame]) -> None:
     expected = [digest(frame) for frame in frames]
     next(generator.frames(0))
     assert [digest(frame) for frame in generator.frames(2)] == expected

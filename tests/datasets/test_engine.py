@@ -186,10 +186,9 @@ def test_too_little_space_is_told_before_the_start(tmp_path: Path, monkeypatch: 
 def test_sizes_are_known_after_the_first_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "set"
     monkeypatch.setattr(engine, "expected_bytes_per_frame", lambda info, formats: 1.0)
-    frame = 32 * 24 * 7
 
     class Usage:
-        free = 3 * FRAMES_PER_SCENE * frame
+        free = 3 * FRAMES_PER_SCENE * 32 * 24 * 7
 
     monkeypatch.setattr(engine.shutil, "disk_usage", lambda path: Usage)
     with pytest.raises(DatasetError, match="20 frames need about"):

@@ -250,9 +250,13 @@ def test_bytes_repeat_in_another_process() -> None:
     assert ran.stdout.strip() == expected
 
 
-def test_mujocos_renderer_lives_beside_it(renderer: PbrRenderer) -> None:
+def test_mujocos_renderer_lives_beside_it(renderer: PbrRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
     import mujoco
+    from mujoco.egl import GLContext
+    from mujoco.rendering.classic import gl_context
 
+    # Which one MuJoCo takes was settled when it was imported, maybe before anything asked for EGL.
+    monkeypatch.setattr(gl_context, "GLContext", GLContext)
     model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1' rgba='1 0 0 1'/></worldbody></mujoco>")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

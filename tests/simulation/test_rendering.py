@@ -95,7 +95,7 @@ def test_without_egl_one_warning_and_rays(resting: Simulation, monkeypatch: pyte
     def missing(*_: object) -> None:
         raise RenderingError("OpenGL cannot be used without a display here (EGL: none).")
 
-    monkeypatch.setattr(rendering, "_egl_context", missing)
+    monkeypatch.setattr(rendering, "gl_context", missing)
     with pytest.warns(RuntimeWarning, match="--renderer embree") as caught:
         renderer = make_renderer("mujoco", resting.world, resting._rays, resting.camera.intrinsics, FAR)
     assert renderer.name == "embree"

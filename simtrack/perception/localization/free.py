@@ -11,17 +11,20 @@ import numpy as np
 from simtrack.contracts import Float64, LidarScan, Localization, Odometry, RgbdFrame, Status
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import difference, interpolate, inverse
-from simtrack.perception.localization.assessment import UNJUDGED
+from simtrack.perception.localization.assessment import Assessment, judge
 from simtrack.perception.localization.config import MotionConfig, RegistrationConfig
 from simtrack.perception.localization.measurement import Measurement, depth_measurement, deskew, scan_end
 from simtrack.perception.localization.motion import OdometryTrack
 from simtrack.perception.localization.registration import Registration, register
 from simtrack.perception.localization.surface import MapSurface
 
-FREE = RegistrationConfig(floor_sigma=1e3, tilt_sigma=1e3, normal_sigma=0.05)
-"""Floor and tilt say nothing. Normals of a mesh that was made of one view err by some degrees: less would feign
-knowledge of directions along the walls of a room whose floor is not seen."""
-COARSE = replace(FREE, strides=(5,) * 40 + (2,), settled=1e-4, min_gate=0.3, min_kernel=0.05)
+FREE = RegistrationConfig(
+    strides=(5, 5, 3, 3, 3, 2, 2, 2), settled=0.002, floor_sigma=1e3, tilt_sigma=1e3, normal_sigma=0.05
+)
+"""More casts than on a floor with odometry: along weakly constrained directions each moves the pose by little. Floor
+and tilt say nothing. Normals of a mesh that was made of one view err by some degrees: less would feign knowledge of
+directions along the walls of a room whose floor is not seen."""
+COARSE = replace(FREE, strides=(5,) * 40 + (2,), settled=1e-4, min_gate=0.6, min_kernel=0.1)
 """Wide gates, and as many casts as half a metre takes."""
 
 
@@ -37,10 +40,13 @@ class FreeConfig:
     """Metres, standard deviation of a prediction of the motion between two measurements."""
     sigma_angle: float = 0.1
     """Radians, likewise."""
-    steady: float = 0.9
-    """A prediction holds if the registration from it explains this share of what the last measurement's did."""
+    steady: float = 0.01
+    """A prediction holds if, of the shots that meet the map, the registration from it explains no smaller a share than
+    the last one did, less this. Otherwise others are tried."""
+    max_through: float = 0.05
+    """No pose is believed that lets more of the shots pass through surfaces of the map ..."""
     min_share: float = 0.3
-    """Below this explained share of a measurement no pose is believed."""
+    """... or explains a smaller share of them."""
     min_range: float = 0.3
     """Metres: nearer lidar returns are not used."""
     max_range: float = 100.0
@@ -54,7 +60,7 @@ class FreeConfig:
         for name in ("sigma", "sigma_angle", "max_range", "depth_columns", "depth_max_range"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"FreeConfig.{name}", getattr(self, name), "a finite number > 0")
-        for name in ("steady", "min_share"):
+        for name in ("steady", "max_through", "min_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"FreeConfig.{name}", getattr(self, name), "0 to 1")
 
@@ -76,10 +82,11 @@ class FreeLocalizer:
         self.config = config or FreeConfig()
         self.restart(stamp, T_map_base)
 
-    def restart(self, stamp: int, T_map_base: Float64) -> None:
-        """Forget what was measured; start anew at a known pose."""
-        self._poses: list[tuple[int, Float64]] = [(stamp, np.array(T_map_base, dtype=float))]
-        self._level = 0.0
+    def restart(self, stamp: int, T_map_base: Float64, before: tuple[int, Float64] | None = None) -> None:
+        """Forget what was measured; start anew at a known pose, moving since an earlier one (stamp, pose), if given."""
+        known = [(stamp, np.array(T_map_base, dtype=float))]
+        self._poses: list[tuple[int, Float64]] = known if before is None else [before, *known]
+        self._level = 1.0
 
     def follows(self, T_before: Float64, T_after: Float64) -> bool:
         """Whether a motion lies within the three standard deviations beyond which none is believed."""
@@ -119,19 +126,42 @@ class FreeLocalizer:
             return Localization(stamp, T, P, Status.STALE)
         if len(shots) < c.fine.min_correspondences:
             return Localization(stamp, T, P, Status.NO_DATA)
-        found = register(shots, self.surface, T, P, c.fine, assessed=True) if self._level else None
-        if found is None or not found.converged or _explained(found) < c.steady * self._level:
-            coarse = register(shots, self.surface, T, P, c.coarse)
-            again = register(shots, self.surface, T, P, c.fine, T_start=coarse.T_map_base, assessed=True)
-            found = again if found is None or _explained(again) > _explained(found) else found
-        share = _explained(found)
-        if share < c.min_share or not found.converged or not self.follows(T, found.T_map_base):
-            return Localization(stamp, T, P, Status.LOST, share, found.residual)
-        self._level = share
+        best = self._fitted(shots, T, P, T)
+        if not best.registration.converged or best.agreement < self._level - c.steady:
+            coarse = (register(shots, self.surface, T, P, c.coarse, T_start=S) for S in (T, self._poses[-1][1]))
+            best = max((best, *(self._fitted(shots, T, P, start.T_map_base) for start in coarse)), key=_score)
+        found, judged = best.registration, best.assessment
+        fits = judged.explained >= c.min_share and judged.through <= c.max_through
+        if not (fits and found.converged and self.follows(T, found.T_map_base)):
+            return Localization(stamp, T, P, Status.LOST, judged.explained, found.residual)
+        self._level = best.agreement
         self._poses = [self._poses[-1], (stamp, found.T_map_base)]
         status = Status.OK if found.observed == 6 else Status.DEGRADED
-        return Localization(stamp, found.T_map_base, found.covariance, status, share, found.residual)
+        return Localization(stamp, found.T_map_base, found.covariance, status, judged.explained, found.residual)
+
+    def _fitted(self, shots: Measurement, T_prior: Float64, covariance: Float64, T_start: Float64) -> "_Fit":
+        found = register(shots, self.surface, T_prior, covariance, self.config.fine, T_start=T_start)
+        view = self.surface.cast(found.T_map_base, shots, stride=2)
+        covered = float(np.mean(np.isfinite(view.hits.distances)))
+        return _Fit(found, judge(view), covered)
 
 
-def _explained(found: Registration) -> float:
-    return (found.assessment or UNJUDGED).explained
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """A registration, judged by the shots that meet the map: it may end where a sensor looks now."""
+
+    registration: Registration
+    assessment: Assessment
+    covered: float
+    """Share of the shots that meet the map."""
+
+    @property
+    def agreement(self) -> float:
+        """Share explained of the shots that meet the map."""
+        return self.assessment.explained / self.covered if self.covered else 0.0
+
+
+def _score(fit: _Fit) -> float:
+    """What is explained, less what is contradicted; a pose that merely looks at more of the map gains little."""
+    contradicted = fit.covered - fit.assessment.explained
+    return fit.assessment.explained - 3.0 * contradicted if fit.registration.converged else -np.inf

@@ -380,7 +380,9 @@ class ObjectTracker:
             if target.model is not model or not (unseen or demoted):
                 continue
             distance = np.linalg.norm(followed.state.T_map_object[:3, 3] - target.filter.state.T_map_object[:3, 3])
-            if age < self.config.same_object_memory and distance < 0.15 + self.config.same_object_speed * age:
+            reach = 0.15 + self.config.same_object_speed * min(age, self.config.same_object_memory)
+            # What is not believed any more where it was is not somewhere else for being long unseen.
+            if (demoted or age < self.config.same_object_memory) and distance < reach:
                 self._registration.remove(target.id)
                 return self._revive(target, followed.state.stamp)
         return None
