@@ -237,6 +237,7 @@ class ClosedLoopRun:
             classes = [thing.model for thing in config.scene.objects]
             truths = exits.enter_context(TruthTables(folder.path, config.scene.name, classes))
             loop = exits.enter_context(closed(config, config.agent_name))
+            folder.write_map(loop.simulation.static_map)
             log = exits.enter_context(open_log(config, loop)) if config.log is not None else None
             evaluator = exits.enter_context(Evaluator(loop.simulation, config.stack, config.seconds))
             for observer in self.observers:

@@ -54,6 +54,7 @@ class Replay:
             folder = RunFolder(self._out, self._overwrite)
             origin = {"recording": str(self._recording), "metadata": dict(recording.metadata), "versions": versions()}
             folder.write_config(origin)
+            folder.write_map(recording.static_map)
             tables = exits.enter_context(EstimateTables(folder.path))
             stack = PerceptionStack(
                 recording.static_map,

@@ -3,8 +3,8 @@
 ``config.yaml`` resolved configuration and versions; ``estimates.csv`` and ``tracks.csv`` what the stack believed of the
 robot and of every object; ``trajectory.csv`` true and believed pose of the base; ``poses.csv`` one line an
 object-frame; ``simtrack_<scene>-test.csv`` results in the format of the BOP challenge; ``graph.json`` the scene
-graph; ``metrics.json``; ``report.html``. Of a recording without a robot: ``frames.csv`` how its frames compare with
-``map.ply``, the map that they make.
+graph; ``map.npz`` the surveyed map, as the stack has it; ``metrics.json``; ``report.html``. Of a recording without a
+robot: ``frames.csv`` how its frames compare with ``map.ply``, the map that they make.
 """
 
 import csv
@@ -14,7 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from simtrack.contracts import Belief, Float64
+import numpy as np
+
+from simtrack.contracts import Belief, Float64, StaticMap
 from simtrack.errors import InvalidValueError, OutputExistsError
 from simtrack.evaluation.metrics import Metric, write_atomically, write_metrics
 from simtrack.evaluation.tracking import ObjectFrame
@@ -22,7 +24,7 @@ from simtrack.geometry.transforms import quaternion_from_rotation
 
 OWN_FILES = (
     "config.yaml", "estimates.csv", "tracks.csv", "trajectory.csv", "poses.csv", "graph.json", "metrics.json",
-    "report.html", "frames.csv", "map.ply",
+    "report.html", "frames.csv", "map.ply", "map.npz",
 )  # fmt: skip
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 TRAJECTORY = ("stamp_ns", "status", *(f"{who}_{c}" for who in ("true", "estimated") for c in _POSE))
@@ -76,6 +78,17 @@ class RunFolder:
     def write_graph(self, text: str) -> None:
         """Replace ``graph.json``."""
         write_atomically(self.path / "graph.json", text)
+
+    def write_map(self, static_map: StaticMap) -> None:
+        """Write ``map.npz``: the mesh of the surveyed map and which of its entities each face belongs to."""
+        from simtrack.perception.mapping.static_entities import face_owners
+
+        names = np.array([entity.name for entity in static_map.entities], dtype=np.str_)
+        arrays = {"vertices": static_map.vertices, "faces": static_map.faces, "owners": face_owners(static_map)}
+        temporary = self.path / ".map.npz.part"
+        with temporary.open("wb") as stream:
+            np.savez_compressed(stream, allow_pickle=False, names=names, **arrays)
+        temporary.replace(self.path / "map.npz")
 
 
 class _Tables:

@@ -56,6 +56,10 @@ class FindingCode(StrEnum):
     """Entities would have supported one another; the weakest support was dropped."""
     SUNK = "sunk"
     """The entity lies below its support plane altogether; its box was not refined."""
+    IN_MOTION = "in-motion"
+    """Left out: it moved, or stood on what moved, when the scene was taken; nothing at rest holds it."""
+    MODEL_MISSING = "model-missing"
+    """An object whose model is not to be found; its box stands for it."""
 
 
 @dataclass(frozen=True, slots=True)
