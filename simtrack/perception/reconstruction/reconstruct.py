@@ -1,0 +1,233 @@
+"""From a contact graph to a functional scene: every entity gets a model, every model its place, the scene its joints.
+
+    reconstruction = reconstruct(graph)
+    write_scene(reconstruction.tree, "scene")
+
+Section 4 of the reconstruction paper: matching and alignment (4.2, 4.3), the global check (4.4), the kinematic tree
+(4.5). No entity is lost: what no CAD model fits stays as its own mesh, and a finding says so.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from simtrack.contracts import Float64
+from simtrack.errors import MeshError, UnknownNameError
+from simtrack.objects.cad import CadModel, cad_classes, cad_models
+from simtrack.perception.reconstruction.body_tree import BodyTree
+from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.kinematic_tree import kinematic_tree
+from simtrack.perception.reconstruction.own_model import is_own, own_candidate
+from simtrack.perception.reconstruction.selection import Rejection, Selection, SelectionConfig, select
+from simtrack.perception.reconstruction.snapping import Snapped, SnappingConfig, snap
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_layout
+from simtrack.perception.scene_graph.contact.nodes import FLOOR, SCENE, EntityNode
+
+Shortlist = Callable[[EntityNode, ContactGraph, Sequence[CadModel]], Sequence[CadCandidate]]
+"""Aligned candidates of a node among models of its class, by rising alignment error."""
+Progress = Callable[[str, float], None]
+"""Hears what is being done and the share of the work that is done, 0 to 1."""
+
+
+class NoteCode(StrEnum):
+    """What the reconstruction has to say of an entity, beside the findings of the contact graph."""
+
+    NO_MODEL = "no-model"
+    """The catalogue lacks its class: it is its own mesh."""
+    NO_CANDIDATE = "no-candidate"
+    """No model of its class could be aligned: it is its own mesh."""
+    APPROXIMATED = "approximated"
+    """Its shape in physics is coarser than it was meant to be."""
+    LEFT_OUT = "left-out"
+    """Nothing can be made of it."""
+    SUPPORT_LOST = "support-lost"
+    """The model supports less of a child's bottom than Eq. 2 asks."""
+    IN_LAYOUT = "in-layout"
+    """All candidates stand in a wall."""
+    CONFLICT = "conflict"
+    """No selection keeps it out of another entity."""
+    INTERPENETRATING = "interpenetrating"
+    """It is in another entity, also after snapping."""
+    AFLOAT = "afloat"
+    """There is nothing of its supporter below it."""
+    GROUND_INFERRED = "ground-inferred"
+    """No floor was seen: a level ground lies below the lowest entity."""
+    HELD = "held"
+    """Nothing supports it: it is fixed where it was seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something about a reconstruction that a user should know."""
+
+    code: NoteCode
+    entity: str
+    """Name, or empty for the scene."""
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReconstructionConfig:
+    """Settings of the stages; those of matching and alignment go with the shortlist."""
+
+    selection: SelectionConfig = field(default_factory=SelectionConfig)
+    snapping: SnappingConfig = field(default_factory=SnappingConfig)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """The model that an entity got."""
+
+    candidate: CadCandidate
+    """At its final pose."""
+    rank: int
+    """Its place in the shortlist by alignment error."""
+    offered: int
+    """Length of the shortlist."""
+    shift: Float64
+    """(3,), translation by the snapping, metres."""
+    residual: float
+    """D of Eq. 1 after snapping, metres; NaN where Eq. 1 does not apply."""
+    rejected: tuple[Rejection, ...]
+
+    @property
+    def own_mesh(self) -> bool:
+        """Whether the entity kept its own mesh."""
+        return is_own(self.candidate)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconstruction:
+    """A functional scene cg' and how it came about."""
+
+    name: str
+    graph: ContactGraph
+    choices: Mapping[str, Choice]
+    """Entity -> model; layout has none."""
+    tree: BodyTree
+    notes: tuple[Note, ...]
+
+
+def reconstruct(
+    graph: ContactGraph,
+    config: ReconstructionConfig | None = None,
+    *,
+    name: str = "scene",
+    shortlist: Shortlist | None = None,
+    progress: Progress | None = None,
+) -> Reconstruction:
+    """Replace entities by CAD models and make the scene one of bodies and joints.
+
+    Args:
+        graph: contact graph of entities with meshes.
+        config: thresholds.
+        name: of the scene.
+        shortlist: matches and aligns; sections 4.2 and 4.3 if None.
+        progress: called between steps.
+
+    Raises:
+        InvalidValueError: a node has no mesh (the graph was read from a file).
+    """
+    config = config or ReconstructionConfig()
+    say = progress or (lambda what, share: None)
+    notes: list[Note] = []
+    shortlists = _shortlists(graph, shortlist or _default_shortlist(), say, notes)
+    say("checking candidates against each other", 0.8)
+    selection = select(graph, shortlists, config.selection)
+    chosen = {entity: shortlists[entity][rank] for entity, rank in selection.chosen.items()}
+    _selection_notes(selection, notes)
+    ground = _ground(graph, chosen, notes)
+    say("snapping", 0.9)
+    snapped = snap(graph, chosen, config.snapping, ground)
+    _snapping_notes(graph, snapped, notes)
+    say("kinematic tree", 0.98)
+    tree = kinematic_tree(name, graph, snapped.candidates, ground)
+    choices = {
+        entity: Choice(
+            candidate=snapped.candidates[entity],
+            rank=rank,
+            offered=len(shortlists[entity]),
+            shift=snapped.shifts[entity],
+            residual=snapped.residuals.get(entity, np.nan),
+            rejected=tuple(selection.rejected.get(entity, ())),
+        )
+        for entity, rank in selection.chosen.items()
+    }
+    return Reconstruction(name, graph, choices, tree, tuple(notes))
+
+
+def _default_shortlist() -> Shortlist:
+    from simtrack.perception.reconstruction.alignment import shortlist
+
+    return shortlist
+
+
+def _shortlists(
+    graph: ContactGraph, shortlist: Shortlist, say: Progress, notes: list[Note]
+) -> dict[str, Sequence[CadCandidate]]:
+    """Candidates of every entity but layout, parents before children; its own mesh for what has none."""
+    out: dict[str, Sequence[CadCandidate]] = {}
+    entities = [name for name in graph.descendants() if not is_layout(graph.nodes[name])]
+    for number, name in enumerate(entities):
+        say(f"matching {name}", 0.8 * number / len(entities))
+        node = graph.nodes[name]
+        try:
+            found = tuple(shortlist(node, graph, cad_models(node.semantic_class)))
+            if not found:
+                message = f"no model of the class '{node.semantic_class}' could be aligned; its own mesh stands for it"
+                notes.append(Note(NoteCode.NO_CANDIDATE, name, message))
+        except UnknownNameError:
+            found = ()
+            known = ", ".join(cad_classes())
+            message = f"there is no model of the class '{node.semantic_class}'; its own mesh stands for it"
+            notes.append(Note(NoteCode.NO_MODEL, name, f"{message} (classes: {known})"))
+        out[name] = found or _own(node, notes)
+    return out
+
+
+def _own(node: EntityNode, notes: list[Note]) -> Sequence[CadCandidate]:
+    try:
+        candidate, said = own_candidate(node)
+    except MeshError as error:
+        notes.append(Note(NoteCode.LEFT_OUT, node.name, f"nothing can be made of it: {error}"))
+        return ()
+    if said:
+        notes.append(Note(NoteCode.APPROXIMATED, node.name, said))
+    return (candidate,)
+
+
+def _selection_notes(selection: Selection, notes: list[Note]) -> None:
+    for name, children in selection.lost.items():
+        message = f"none of its candidates has room for all that it supports; too little is under {', '.join(children)}"
+        notes.append(Note(NoteCode.SUPPORT_LOST, name, message))
+    for name, depth in selection.in_layout.items():
+        notes.append(Note(NoteCode.IN_LAYOUT, name, f"every candidate stands {1e3 * depth:.0f} mm or more in a wall"))
+    for first, second, depth in selection.conflicts:
+        message = f"no candidates of it and of '{second}' stay apart: {1e3 * depth:.0f} mm deep before snapping"
+        notes.append(Note(NoteCode.CONFLICT, first, message))
+
+
+def _ground(graph: ContactGraph, chosen: Mapping[str, CadCandidate], notes: list[Note]) -> float | None:
+    """Height of a floor that nobody saw, if it is needed."""
+    loose = [name for name in graph.children(SCENE) if name in chosen]
+    if any(node.semantic_class == FLOOR for node in graph.nodes.values()):
+        for name in loose:
+            notes.append(Note(NoteCode.HELD, name, "nothing supports it; it is fixed where it was seen"))
+        return None
+    if not loose:
+        return None
+    height = min(graph.nodes[name].bottom for name in loose)
+    message = f"no floor was seen: a level ground is put at z = {height:.3f} m, under {', '.join(loose)}"
+    notes.append(Note(NoteCode.GROUND_INFERRED, "", message))
+    return height
+
+
+def _snapping_notes(graph: ContactGraph, snapped: Snapped, notes: list[Note]) -> None:
+    for name in snapped.afloat:
+        message = f"nothing of '{graph.parent(name)}' is below it"
+        notes.append(Note(NoteCode.AFLOAT, name, message))
+    for first, second, depth in snapped.stuck:
+        message = f"is still {1e3 * depth:.1f} mm deep in '{second}' after snapping"
+        notes.append(Note(NoteCode.INTERPENETRATING, first, message))

@@ -1,0 +1,242 @@
+"""Global physical violation check (section 4.4 of the reconstruction paper): which candidate each entity gets.
+
+Candidates that cannot support what stands on the entity (Eq. 2), or that stand in a wall, are discarded; then one is
+selected for each entity, so that they stay out of each other: min-conflicts search (Minton et al., 1992) from the
+candidates of least alignment error.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from simtrack.contracts import Float64
+from simtrack.errors import InvalidValueError
+from simtrack.geometry.boxes import OrientedBox
+from simtrack.geometry.transforms import transform
+from simtrack.perception.reconstruction.candidates import CadCandidate, PlacedSupport
+from simtrack.perception.reconstruction.layout import layout_slabs, used_planes
+from simtrack.perception.reconstruction.solids import Solid, overlap, solid_of
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
+
+
+@dataclass(frozen=True, slots=True)
+class SelectionConfig:
+    """Thresholds of the check; lengths in metres."""
+
+    contact_area: float = 0.5
+    """b_th of Eq. 2."""
+    height: float = 0.12
+    """How far a candidate's support may lie above or below where the child stands: snapping moves the child."""
+    wall_depth: float = 0.06
+    """How far a candidate may stand in layout: snapping pushes it out."""
+    overlap_depth: float = 0.01
+    """How deep two candidates may be in each other: snapping pushes them apart."""
+    steps: int = 200
+    """Of the min-conflicts search."""
+    seed: int = 0
+    """Of its random choices."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.contact_area <= 1.0:
+            raise InvalidValueError("SelectionConfig.contact_area", self.contact_area, "a share in (0, 1]")
+        for name in ("height", "wall_depth", "overlap_depth"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise InvalidValueError(f"SelectionConfig.{name}", getattr(self, name), "finite and >= 0")
+        if self.steps < 0:
+            raise InvalidValueError("SelectionConfig.steps", self.steps, "0 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """Why a candidate was not taken."""
+
+    rank: int
+    """Place in the shortlist, 0 for the least alignment error."""
+    model: str
+    reason: str
+
+
+@dataclass(slots=True)
+class Selection:
+    """What the check decided."""
+
+    chosen: dict[str, int] = field(default_factory=dict)
+    """Entity -> rank of its candidate in the shortlist."""
+    rejected: dict[str, list[Rejection]] = field(default_factory=dict)
+    lost: dict[str, list[str]] = field(default_factory=dict)
+    """Entity -> children that its chosen candidate does not support as Eq. 2 asks."""
+    in_layout: dict[str, float] = field(default_factory=dict)
+    """Entity -> depth in metres, where every candidate stands too deep in layout."""
+    conflicts: list[tuple[str, str, float]] = field(default_factory=list)
+    """Pairs that no selection keeps apart, and the depth in metres."""
+
+
+def select(
+    graph: ContactGraph, shortlists: Mapping[str, Sequence[CadCandidate]], config: SelectionConfig | None = None
+) -> Selection:
+    """Select one candidate for every entity that has any; `shortlists` are sorted by alignment error."""
+    config = config or SelectionConfig()
+    out = Selection()
+    solids = {name: [solid_of(candidate) for candidate in found] for name, found in shortlists.items() if found}
+    kept = {name: _kept(graph, name, shortlists[name], solids[name], config, out) for name in solids}
+    _min_conflicts(graph, kept, solids, config, out)
+    for name, ranks in kept.items():
+        for rank in ranks:
+            if rank < out.chosen[name]:
+                reason = "stands in another entity's model"
+                out.rejected.setdefault(name, []).append(Rejection(rank, shortlists[name][rank].model.name, reason))
+    return out
+
+
+# -------------------------------------------------------------------------------------------------------------- pruning
+
+
+def _kept(
+    graph: ContactGraph,
+    name: str,
+    candidates: Sequence[CadCandidate],
+    solids: Sequence[Solid],
+    config: SelectionConfig,
+    out: Selection,
+) -> list[int]:
+    """Ranks that survive; if none does, those that keep most children, of them those least deep in layout."""
+    children = [c for c in graph.children(name) if graph.supports[c].kind in (SupportKind.ON, SupportKind.INSIDE)]
+    dropped = [[c for c in children if not supports_child(y, graph, c, config)] for y in candidates]
+    depths = [_layout_depth(solid, graph) for solid in solids]
+    fewest = min(len(names) for names in dropped)
+    able = [k for k, names in enumerate(dropped) if len(names) == fewest]
+    least = max(min(depths[k] for k in able), config.wall_depth)
+    ranks = [k for k in able if depths[k] <= least]
+    for k, candidate in enumerate(candidates):
+        if k in ranks:
+            continue
+        names = ", ".join(dropped[k])
+        reason = (
+            f"cannot support {names} (Eq. 2)" if k not in able else f"stands {1e3 * depths[k]:.0f} mm deep in layout"
+        )
+        out.rejected.setdefault(name, []).append(Rejection(k, candidate.model.name, reason))
+    if fewest:
+        out.lost[name] = dropped[ranks[0]]
+    if least > config.wall_depth:
+        out.in_layout[name] = least
+    return ranks
+
+
+def supports_child(candidate: CadCandidate, graph: ContactGraph, child: str, config: SelectionConfig) -> bool:
+    """Whether Eq. 2 holds for a candidate and a child's box, near where the child stands."""
+    box, height = graph.nodes[child].box, graph.supports[child].height
+    return best_face(candidate, box, height, config.height, config.contact_area) is not None
+
+
+def standing_faces(candidate: CadCandidate) -> tuple[PlacedSupport, ...]:
+    """The model's declared supports; the top of its box for one that declares none."""
+    declared = candidate.supports()
+    if declared or not candidate.upright:
+        return declared
+    T = candidate.T_map_model @ transform(None, (0.0, 0.0, 0.5 * float(candidate.extents[2])))
+    return (PlacedSupport(candidate.model.parts[0].name, T, candidate.extents[:2], np.inf),)
+
+
+def best_face(
+    candidate: CadCandidate, child: OrientedBox, height: float, reach: float, least: float
+) -> PlacedSupport | None:
+    """The face nearest in height under at least a share of the child's bottom (A of Eq. 2); None if there is none."""
+    faces = standing_faces(candidate)
+    found = [
+        (abs(face.height - height), k)
+        for k, face in enumerate(faces)
+        if abs(face.height - height) <= reach and contact_share(child, face) >= least
+    ]
+    return faces[min(found)[1]] if found else None
+
+
+def contact_share(child: OrientedBox, face: PlacedSupport) -> float:
+    """A(v_p and v_c) / A(v_c) of Eq. 2: share of the bottom of the child's box that lies over a face."""
+    from shapely import Polygon
+
+    bottom = Polygon(_rectangle(child.T_map_box, child.extents[:2]))
+    top = Polygon(_rectangle(face.T_map_support, face.size))
+    return bottom.intersection(top).area / max(bottom.area, 1e-12)
+
+
+def _rectangle(T: Float64, size: Float64) -> Float64:
+    corners = 0.5 * size * [[-1, -1], [1, -1], [1, 1], [-1, 1]]
+    return corners @ T[:2, :2].T + T[:2, 3]
+
+
+def _layout_depth(solid: Solid, graph: ContactGraph) -> float:
+    """How deep a solid is in walls and ceilings, metres; floors are a matter of support."""
+    deepest = 0.0
+    for node in graph.nodes.values():
+        if not is_layout(node) or node.semantic_class == "floor":
+            continue
+        for slab in layout_slabs(node, used_planes(graph, node.name)):
+            volume, depth = overlap(solid, Solid.of([slab.vertices]))
+            deepest = max(deepest, depth) if volume > 0.0 else deepest
+    return deepest
+
+
+# --------------------------------------------------------------------------------------------------------------- search
+
+
+class _Conflicts:
+    """Volumes of interpenetration between candidates, found when first asked for."""
+
+    def __init__(self, solids: Mapping[str, Sequence[Solid]], graph: ContactGraph, config: SelectionConfig) -> None:
+        self.solids = solids
+        self.limit = config.overlap_depth
+        self.names = list(solids)
+        boxes = {n: (np.min([s.low.min(0) for s in found], 0), np.max([s.high.max(0) for s in found], 0))
+                 for n, found in solids.items()}  # fmt: skip
+        self.near = {name: [] for name in self.names}
+        for i, a in enumerate(self.names):
+            for b in self.names[i + 1 :]:
+                related = b in graph.supporters(a) or a in graph.supporters(b)
+                apart = (np.maximum(boxes[a][0] - boxes[b][1], boxes[b][0] - boxes[a][1]) > 0.0).any()
+                if not related and not apart:
+                    self.near[a].append(b)
+                    self.near[b].append(a)
+        self._known: dict[tuple[str, int, str, int], tuple[float, float]] = {}
+
+    def between(self, a: str, i: int, b: str, j: int) -> tuple[float, float]:
+        """Volume and depth; (0, depth) for what is no conflict."""
+        if a > b:
+            a, i, b, j = b, j, a, i
+        if (a, i, b, j) not in self._known:
+            volume, depth = overlap(self.solids[a][i], self.solids[b][j])
+            self._known[a, i, b, j] = (volume if depth > self.limit else 0.0), depth
+        return self._known[a, i, b, j]
+
+    def cost(self, name: str, rank: int, chosen: Mapping[str, int]) -> float:
+        """Sum of the volumes that a candidate shares with the chosen ones."""
+        return sum(self.between(name, rank, other, chosen[other])[0] for other in self.near[name])
+
+
+def _min_conflicts(
+    graph: ContactGraph,
+    kept: Mapping[str, Sequence[int]],
+    solids: Mapping[str, Sequence[Solid]],
+    config: SelectionConfig,
+    out: Selection,
+) -> None:
+    conflicts = _Conflicts(solids, graph, config)
+    rng = np.random.default_rng(config.seed)
+    chosen = {name: ranks[0] for name, ranks in kept.items()}
+    best, least = dict(chosen), np.inf
+    for _ in range(config.steps + 1):
+        costs = {name: conflicts.cost(name, chosen[name], chosen) for name in chosen}
+        total = 0.5 * sum(costs.values())
+        if total < least:
+            best, least = dict(chosen), total
+        struck = [name for name, cost in costs.items() if cost > 0.0 and len(kept[name]) > 1]
+        if not struck:
+            break
+        name = struck[int(rng.integers(len(struck)))]
+        chosen[name] = min(kept[name], key=lambda rank: (conflicts.cost(name, rank, chosen), rank))
+    out.chosen = best
+    for name in best:
+        for other in conflicts.near[name]:
+            volume, depth = conflicts.between(name, best[name], other, best[other])
+            if name < other and volume > 0.0:
+                out.conflicts.append((name, other, depth))

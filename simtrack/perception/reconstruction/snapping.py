@@ -1,0 +1,241 @@
+"""Snapping: selected models are moved so that Eq. 1 holds exactly, and out of each other.
+
+The end of section 4.4 of the reconstruction paper, from the root of the tree to its leaves. Heights follow the faces
+that models really have, down to the convex pieces that collide; what stands on a model moves along with it. Then
+models that are still in each other, beside or in a wall, are pushed apart on the level, the lighter one more.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from simtrack.contracts import Float64
+from simtrack.errors import InvalidValueError
+from simtrack.geometry.boxes import OrientedBox
+from simtrack.geometry.transforms import transform
+from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.interference import Contact, Interference
+from simtrack.perception.reconstruction.kinematic_tree import FIXED_CLASSES, scaled_mass
+from simtrack.perception.reconstruction.layout import layout_slabs, used_planes
+from simtrack.perception.reconstruction.selection import best_face
+from simtrack.perception.reconstruction.solids import Solid, resting_rise, solid_of
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
+from simtrack.perception.scene_graph.contact.nodes import SCENE
+
+SLACK = 2e-4
+"""Metres that pushed models keep between them."""
+LEAST_AREA = 0.2
+"""Share of a bottom over a face from which it is taken for the one that is stood on."""
+LEVEL = 0.7
+"""|z| of a contact's normal from which it is a matter of support."""
+
+
+@dataclass(frozen=True, slots=True)
+class SnappingConfig:
+    """Limits of snapping; lengths in metres."""
+
+    reach: float = 0.2
+    """How far above or below its place a face to stand on is looked for."""
+    sink: float = 0.04
+    """How far a model may stand in what it stands on, at most half of its height; what is deeper in is beside it."""
+    depth: float = 0.001
+    """Interpenetration that is left alone."""
+    rounds: int = 40
+    """Of pushing apart."""
+
+    def __post_init__(self) -> None:
+        for name in ("reach", "sink", "depth"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InvalidValueError(f"SnappingConfig.{name}", getattr(self, name), "a positive finite length")
+        if self.rounds < 0:
+            raise InvalidValueError("SnappingConfig.rounds", self.rounds, "0 or more")
+
+
+@dataclass(slots=True)
+class Snapped:
+    """The scene after snapping."""
+
+    candidates: dict[str, CadCandidate]
+    """At their final poses."""
+    shifts: dict[str, Float64]
+    """Entity -> (3,) translation from where alignment had it, metres."""
+    residuals: dict[str, float]
+    """Entity -> D of Eq. 1 that is left, metres; of those that stand on something."""
+    afloat: list[str] = field(default_factory=list)
+    """Entities below which there is nothing of their supporter."""
+    stuck: list[tuple[str, str, float]] = field(default_factory=list)
+    """Pairs that are still in each other, and how deep, metres."""
+
+
+def snap(
+    graph: ContactGraph,
+    chosen: Mapping[str, CadCandidate],
+    config: SnappingConfig | None = None,
+    ground: float | None = None,
+) -> Snapped:
+    """Move the chosen models; `ground` is the height of an unseen floor under those that nothing supports."""
+    return _Snapping(graph, chosen, config or SnappingConfig(), ground).run()
+
+
+class _Snapping:
+    def __init__(
+        self, graph: ContactGraph, chosen: Mapping[str, CadCandidate], config: SnappingConfig, ground: float | None
+    ) -> None:
+        self.graph, self.config, self.ground = graph, config, ground
+        self.chosen = chosen
+        self.order = [name for name in graph.descendants() if name in chosen]
+        self.start = {name: solid_of(chosen[name]) for name in self.order}
+        for node in graph.nodes.values():
+            if is_layout(node):
+                slabs = layout_slabs(node, used_planes(graph, node.name))
+                self.start[node.name] = Solid.of([slab.vertices for slab in slabs])
+        self.shifts = {name: np.zeros(3) for name in self.start}
+        self.afloat: set[str] = set()
+        self.ancestors = {name: self._above(name) for name in self.order}
+        self.weight = {name: self._mobility(name) for name in self.start}
+
+    def run(self) -> Snapped:
+        self._stack()
+        stuck: list[Contact] = []
+        if self.order:
+            scene = Interference(self.start)
+            for _ in range(self.config.rounds):
+                stuck = self._beside(scene.contacts(self.shifts))
+                if not any(self._push(contact) for contact in stuck):
+                    break
+                self._stack()
+            stuck = self._deepest(scene.contacts(self.shifts))
+        candidates = {name: self._placed(name) for name in self.order}
+        stands = {n: s for n, s in self.graph.supports.items() if s.kind in (SupportKind.ON, SupportKind.INSIDE)}
+        return Snapped(
+            candidates,
+            {name: self.shifts[name] for name in self.order},
+            {name: self._residual(name) for name in stands if name in candidates},
+            sorted(self.afloat),
+            [(c.first, c.second, c.depth) for c in stuck],
+        )
+
+    # ---------------------------------------------------------------------------------------------------------- heights
+
+    def _stack(self) -> None:
+        """From the root to the leaves: put everything down on what supports it."""
+        self.afloat.clear()
+        for name in self.order:
+            support = self.graph.supports[name]
+            if support.kind is SupportKind.HUNG:
+                self._hang(name, support.parent, support.plane)
+            elif support.kind is SupportKind.ROOT:
+                if self.ground is not None:
+                    self.shifts[name][2] += self.ground - self._solid(name).bottom
+            else:
+                self._put_down(name, support.parent, support.height)
+
+    def _put_down(self, name: str, parent: str, height: float) -> None:
+        solid = self._solid(name)
+        if parent in self.chosen:
+            box = self.graph.nodes[name].box
+            moved = OrientedBox(transform(None, self.shifts[name]) @ box.T_map_box, box.extents)
+            at = height + self.shifts[parent][2]
+            face = best_face(self._placed(parent), moved, at, self.config.reach, LEAST_AREA)
+            if face is not None:
+                solid = self._lift(name, face.height - solid.bottom)
+        below = {p: self._solid(p) for p in self.graph.supporters(name) if p != SCENE and p in self.start}
+        tall = float(solid.high[:, 2].max() - solid.bottom)
+        up = min(self.config.sink, 0.5 * tall)
+        found = resting_rise(solid, below, (-self.config.reach, up))
+        if found is None:
+            found = resting_rise(solid, below, (-np.inf, up))
+        if found is None:
+            self.afloat.add(name)
+        else:
+            self._lift(name, found)
+
+    def _hang(self, name: str, parent: str, index: int) -> None:
+        """Move along the normal of the plane that it hangs on, so that they touch."""
+        plane = self.graph.nodes[parent].planes[index]
+        shift = self.shifts[parent]
+        off = min(float(plane.distance(piece - shift).min()) for piece in self._solid(name).pieces)
+        self.shifts[name] -= off * plane.normal
+        self._carry(name, -off * plane.normal)
+
+    def _lift(self, name: str, height: float) -> Solid:
+        """Raise an entity; what stands on it follows."""
+        step = np.array([0.0, 0.0, height])
+        self.shifts[name] += step
+        self._carry(name, step)
+        return self._solid(name)
+
+    # ---------------------------------------------------------------------------------------------------- pushing apart
+
+    def _beside(self, contacts: list[Contact]) -> list[Contact]:
+        """Contacts with level normals between entities that may be moved."""
+        return [
+            contact
+            for contact in contacts
+            if contact.depth > self.config.depth
+            and abs(contact.normal[2]) < LEVEL
+            and self.weight[contact.first] + self.weight[contact.second] > 0.0
+        ]
+
+    def _push(self, contact: Contact) -> bool:
+        a, b = contact.first, contact.second
+        level = contact.normal * [1.0, 1.0, 0.0]
+        length = float(np.linalg.norm(level))
+        step = (contact.depth / length + SLACK) * level / length  # so that it is out along the sloping normal, too
+        share = self.weight[b] / (self.weight[a] + self.weight[b])
+        if a in self.ancestors.get(b, ()):
+            share = 1.0
+        elif b in self.ancestors.get(a, ()):
+            share = 0.0
+        for name, part in ((a, (share - 1.0) * step), (b, share * step)):
+            if np.any(part):
+                self.shifts[name] += part
+                self._carry(name, part)
+        return True
+
+    def _deepest(self, contacts: list[Contact]) -> list[Contact]:
+        """The deepest contact of every pair of entities that is too deep."""
+        worst: dict[tuple[str, str], Contact] = {}
+        for contact in contacts:
+            key = contact.first, contact.second
+            movable = self.weight[contact.first] + self.weight[contact.second] > 0.0
+            if movable and contact.depth > max(worst[key].depth if key in worst else 0.0, self.config.depth):
+                worst[key] = contact
+        return sorted(worst.values(), key=lambda contact: -contact.depth)
+
+    # ----------------------------------------------------------------------------------------------------------- access
+
+    def _solid(self, name: str) -> Solid:
+        return self.start[name].moved(self.shifts[name])
+
+    def _placed(self, name: str) -> CadCandidate:
+        T = np.array(self.chosen[name].T_map_model, dtype=float)
+        T[:3, 3] += self.shifts[name]
+        return replace(self.chosen[name], T_map_model=T)
+
+    def _carry(self, name: str, step: Float64) -> None:
+        for other in self.graph.descendants(name):
+            if other in self.chosen:
+                self.shifts[other] += step
+
+    def _above(self, name: str) -> list[str]:
+        names = []
+        while (name := self.graph.parent(name)) != SCENE:
+            names.append(name)
+        return names
+
+    def _mobility(self, name: str) -> float:
+        """Zero for layout and what hangs; else the lighter, the more, and furniture less."""
+        if name not in self.chosen:
+            return 0.0
+        mass = scaled_mass(self.chosen[name]) * (
+            10.0 if self.graph.nodes[name].semantic_class in FIXED_CLASSES else 1.0
+        )
+        return 1.0 / max(mass, 1e-3)
+
+    def _residual(self, name: str) -> float:
+        """D of Eq. 1: height of the model's bottom above the highest point that it stands on; NaN if on nothing."""
+        below = {p: self._solid(p) for p in self.graph.supporters(name) if p in self.start}
+        found = resting_rise(self._solid(name), below, (-self.config.reach, self.config.sink))
+        return np.nan if found is None else -found
