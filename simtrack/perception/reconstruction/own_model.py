@@ -12,6 +12,7 @@ from simtrack.geometry.meshes import Mesh, concatenate, convex_hull, decimate, t
 from simtrack.geometry.transforms import inverse, transform
 from simtrack.objects.cad.model import CadModel, CadPart, CadSupport
 from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.convex_pieces import convex_pieces, levelled
 from simtrack.perception.reconstruction.decomposition import decomposed
 from simtrack.perception.reconstruction.physical import physical_properties
 from simtrack.perception.scene_graph.contact.nodes import EntityNode
@@ -42,11 +43,13 @@ def own_candidate(node: EntityNode) -> tuple[CadCandidate, str]:
     """
     if node.shape is None:
         raise InvalidValueError("node.shape", None, f"a mesh; '{node.name}' was read from a file without one")
-    T_box_entity = inverse(node.box.T_map_box) @ node.T_map_entity
-    mesh, flat = _solidified(transformed(node.shape.mesh, T_box_entity))
+    T_box_map = inverse(node.box.T_map_box)
+    seen = levelled(transformed(node.shape.mesh, T_box_map @ node.T_map_entity), node.planes, T_box_map)
+    mesh, flat = _solidified(seen)
     low = -0.5 * float(node.box.extents[2])
-    parts, failure = decomposed(mesh, node.semantic_class)
-    parts = [_pressed(part, low) for part in parts]
+    hulls, rest = convex_pieces(mesh)
+    pieces, failure = decomposed(rest, node.semantic_class) if rest is not None else ((), "")
+    parts = [_pressed(part, low) for part in (*hulls, *pieces)]
     foot = _foot(mesh, low)
     if foot is not None:
         parts.append(foot)
