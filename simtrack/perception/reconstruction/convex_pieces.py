@@ -15,8 +15,10 @@ from simtrack.geometry.planes import SurfacePlane
 
 LEVEL = np.cos(np.radians(3.0))
 """From here on a plane is taken for level: it carries noise, and water finds no slope on furniture."""
-TOLERANCE = 0.01
-"""Metres off its hull up to which a piece is convex: twice the noise of a survey."""
+TOLERANCE, SHARE = 0.015, 0.01
+"""Metres, or share of its diagonal, by which a convex piece may lie off its hull: three times the noise of a survey."""
+BULGE = 0.03
+"""Metres that a hull may bulge beyond the wavy sides of a board."""
 UNDERSIDE = -0.7
 """Normals with a lower z face down, where scanners see nothing."""
 OPEN_SHARE = 0.05
@@ -48,32 +50,43 @@ def levelled(mesh: Mesh, planes: Sequence[SurfacePlane], T_mesh_map: Float64) ->
 
 def convex_pieces(mesh: Mesh) -> tuple[list[Mesh], Mesh | None]:
     """Hulls of the connected pieces that are convex, and the rest of the mesh (None if nothing is left)."""
-    pieces = connected_pieces(mesh)
-    if len(pieces) > MAX_PIECES:
-        return [], mesh
-    hulls, rest = [], []
-    for faces in pieces:
-        used, local = np.unique(mesh.faces[faces], return_inverse=True)
-        hull = hull_of_piece(Mesh(mesh.vertices[used], local.reshape(-1, 3).astype(np.int32)))
-        if hull is None:
-            rest.append(faces)
-        else:
-            hulls.append(hull)
-    if not rest:
-        return hulls, None
-    kept = np.sort(np.concatenate(rest))
-    used, local = np.unique(mesh.faces[kept], return_inverse=True)
-    colors = None if mesh.face_colors is None else mesh.face_colors[kept]
-    return hulls, Mesh(mesh.vertices[used], local.reshape(-1, 3).astype(np.int32), colors)
+    hulls: list[Mesh] = []
+    left = np.arange(len(mesh.faces))
+    for joined in (True, False):
+        # Boards that meet corner to corner are one piece by their corners, but not by the numbers of their vertices.
+        part = _part(mesh, left)
+        pieces = connected_pieces(part, joined=joined)
+        if len(pieces) > MAX_PIECES:
+            break
+        found = [hull_of_piece(_part(part, faces)) for faces in pieces]
+        hulls += [hull for hull in found if hull is not None]
+        rest = [faces for faces, hull in zip(pieces, found, strict=True) if hull is None]
+        if not rest:
+            return hulls, None
+        left = left[np.sort(np.concatenate(rest))]
+    return hulls, _part(mesh, left)
 
 
-def connected_pieces(mesh: Mesh) -> list[np.ndarray]:
-    """Indices of the faces of each piece of the surface that hangs together at its vertices."""
+def _part(mesh: Mesh, faces: np.ndarray) -> Mesh:
+    used, local = np.unique(mesh.faces[faces], return_inverse=True)
+    colors = None if mesh.face_colors is None else mesh.face_colors[faces]
+    return Mesh(mesh.vertices[used], local.reshape(-1, 3).astype(np.int32), colors)
+
+
+def connected_pieces(mesh: Mesh, *, joined: bool = True) -> list[np.ndarray]:
+    """Indices of the faces of each piece of the surface that hangs together at its vertices.
+
+    Args:
+        mesh: any mesh.
+        joined: vertices at the same place are one.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    _, same = np.unique(np.round(mesh.vertices, 7), axis=0, return_inverse=True)
-    faces = same.reshape(-1)[mesh.faces]
+    faces = mesh.faces
+    if joined:
+        _, same = np.unique(np.round(mesh.vertices, 7), axis=0, return_inverse=True)
+        faces = same.reshape(-1)[faces]
     start, end = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     links = coo_matrix((np.ones(len(start), np.int8), (start, end)), (len(mesh.vertices),) * 2)
     piece = connected_components(links, directed=False)[1][faces[:, 0]]
@@ -92,13 +105,14 @@ def hull_of_piece(piece: Mesh) -> Mesh | None:
     normals = face_normals(hull)
     offsets = np.einsum("fd,fd->f", normals, hull.triangles[:, 0])
     points = np.concatenate([piece.vertices, piece.triangles.mean(axis=1)])
-    if (offsets - points @ normals.T).min(axis=1).max() > TOLERANCE:
+    tolerance = max(TOLERANCE, SHARE * float(np.linalg.norm(hull.extents)))
+    if (offsets - points @ normals.T).min(axis=1).max() > tolerance:
         return None
     seen, faces = sample_surface(hull, SAMPLES, np.random.default_rng(0))
     scene = RayScene()
     try:
         scene.add(TriangleMesh(piece.vertices, piece.faces))
-        far = ~np.isfinite(scene.closest_points(seen, TOLERANCE).distances)
+        far = ~np.isfinite(scene.closest_points(seen, BULGE).distances)
     finally:
         scene.close()
     return hull if np.mean(far & (normals[faces, 2] > UNDERSIDE)) <= OPEN_SHARE else None

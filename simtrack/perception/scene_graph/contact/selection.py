@@ -71,7 +71,16 @@ def select_supports(
         supports[name] = choice.support
         others += choice.others
         findings += _doubts(choice, bodies[name])
+    # What lies in a box may touch its underside, as far as noise lets one see; it does not support the box.
+    others = [other for other in others if other.child not in _supporters(other.parent, supports)]
     return supports, tuple(others), findings
+
+
+def _supporters(name: str, supports: Mapping[str, Support]) -> Iterator[str]:
+    """A body and everything below it, up to the root of the tree."""
+    while name != SCENE:
+        yield name
+        name = supports[name].parent
 
 
 def _doubts(choice: _Choice, body: Posed) -> Iterator[Finding]:
@@ -149,7 +158,7 @@ def _touching(
         if options:
             contacts[parent] = max(options, key=lambda option: option.score)
     seated = {parent for parent, option in contacts.items() if option.area >= config.contact_area}
-    hidden_by = {p for p in contacts if any(_rests(q, p, evidence, config) for q in seated if q != p)}
+    hidden_by = {p for p in contacts if _hidden(p, child, contacts, seated, evidence, config)}
     hidden_by -= {p for p in hidden_by if any(_rests(p, q, evidence, config) for q in seated if q != p)}
     open_to = {parent: option for parent, option in contacts.items() if parent not in hidden_by}
     balanced = _balanced(child, open_to.values())
@@ -164,6 +173,20 @@ def _touching(
         choices.append(_Choice(rank, _on(name, parent, found[parent], option, config, touching=True)))
     supports = {c.support.parent: c.support for c in choices}
     return [replace(c, others=tuple(s for p, s in supports.items() if p != c.support.parent)) for c in choices]
+
+
+def _hidden(
+    parent: str,
+    child: Posed,
+    contacts: Mapping[str, SupportOption],
+    seated: set[str],
+    evidence: Evidence,
+    config: ContactConfig,
+) -> bool:
+    """Whether what rests on a parent carries the child: alone with enough area, or several together in balance."""
+    between = [q for q in contacts if q != parent and _rests(q, parent, evidence, config)]
+    several = [contacts[q] for q in between if contacts[q].distance <= contacts[parent].distance]
+    return any(q in seated for q in between) or (len(several) >= 2 and _balanced(child, several))
 
 
 def _direct(pair: PairEvidence) -> Iterator[SupportOption]:
@@ -212,11 +235,11 @@ def _below(pair: PairEvidence, config: ContactConfig) -> Iterator[SupportOption]
 
 
 def _hung(name: str, child: Posed, parent: str, pair: PairEvidence, config: ContactConfig) -> Iterator[_Choice]:
-    """A flat thing before a wall hangs, and so does one whose underside was seen; what has legs does not."""
+    """A flat thing before a wall hangs, one whose underside or the wall below which was seen, too; chairs do not."""
     hang = pair.hang
     if hang is None or child.node.semantic_class in config.standing_classes:
         return
-    if hang.slenderness <= config.hang_slender or child.underside >= 0.3:
+    if hang.slenderness <= config.hang_slender or child.underside >= 0.3 or hang.bare >= config.hang_bare:
         plane = {"plane": hang.plane, "distance": hang.gap, "area": hang.area, "score": hang.area}
         yield _Choice(_Rank.HANGS, Support(name, parent, SupportKind.HUNG, **plane))
 
