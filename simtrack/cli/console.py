@@ -1,5 +1,6 @@
 """What the command prints: messages, tables, a progress line; rich is imported when something is printed."""
 
+import sys
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -23,9 +24,14 @@ def out() -> "Console":
     return Console(highlight=False, width=None if _is_terminal() else 120)
 
 
-def _is_terminal() -> bool:
-    import sys
+def err() -> "Console":
+    """Standard error."""
+    from rich.console import Console
 
+    return Console(stderr=True, highlight=False)
+
+
+def _is_terminal() -> bool:
     return sys.stdout.isatty()
 
 
@@ -70,8 +76,8 @@ def show_table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: 
 class ProgressLine:
     """One live line in a terminal, a line of text now and then elsewhere; a context manager."""
 
-    def __init__(self, title: str, first: str = "building the world") -> None:
-        self._title, self._first = title, first
+    def __init__(self, title: str, first: str = "building the world", *, to_stderr: bool = False) -> None:
+        self._title, self._first, self._to_stderr = title, first, to_stderr
         self._bar: Bar | None = None
         self._task = None
         self._what = ""
@@ -79,7 +85,7 @@ class ProgressLine:
         self._told: set[str] = set()
 
     def __enter__(self) -> "ProgressLine":
-        console = out()
+        console = err() if self._to_stderr else out()
         if console.is_terminal:
             from rich.progress import BarColumn, Progress, TextColumn
 
@@ -98,7 +104,7 @@ class ProgressLine:
             self._bar.update(self._task, state=f"{what}: {thing}" if thing else what)
         elif what not in self._told:
             self._told.add(what)
-            print(f"{self._title}: {what}", flush=True)
+            self._print(f"{self._title}: {what}")
 
     def update(self, progress: "Progress") -> None:
         """Show how far a run is."""
@@ -119,7 +125,10 @@ class ProgressLine:
             self._bar.update(self._task, description=self._title, completed=share, state=state)
         elif time.monotonic() - self._said >= QUIET_PERIOD:
             self._said = time.monotonic()
-            print(f"{self._title}: {state}", flush=True)
+            self._print(f"{self._title}: {state}")
+
+    def _print(self, text: str) -> None:
+        print(text, file=sys.stderr if self._to_stderr else sys.stdout, flush=True)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -12,6 +12,7 @@ from simtrack.cli.generate import generate
 from simtrack.cli.inspect import inspect
 from simtrack.cli.objects import objects
 from simtrack.cli.query import query
+from simtrack.cli.reconstruct import reconstruct
 from simtrack.cli.replay import replay
 from simtrack.cli.run import run
 from simtrack.cli.scenes import scenes
@@ -24,6 +25,7 @@ VERBS = {
     "generate": generate,
     "inspect": inspect,
     "validate": validate,
+    "reconstruct": reconstruct,
     "check": check,
     "scenes": scenes,
     "objects": objects,

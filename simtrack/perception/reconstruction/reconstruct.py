@@ -116,6 +116,7 @@ def reconstruct(
     *,
     name: str = "scene",
     shortlist: Shortlist | None = None,
+    known: Mapping[str, Sequence[CadCandidate]] | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
     """Replace entities by CAD models and make the scene one of bodies and joints.
@@ -125,6 +126,7 @@ def reconstruct(
         config: thresholds.
         name: of the scene.
         shortlist: matches and aligns; sections 4.2 and 4.3 if None.
+        known: entity -> its candidates where they are known beforehand, as of tracked objects.
         progress: called between steps.
 
     Raises:
@@ -133,7 +135,7 @@ def reconstruct(
     config = config or ReconstructionConfig()
     say = progress or (lambda what, share: None)
     notes: list[Note] = []
-    shortlists = _shortlists(graph, shortlist or _default_shortlist(), say, notes)
+    shortlists = _shortlists(graph, shortlist or _default_shortlist(), known or {}, say, notes)
     say("checking candidates against each other", 0.8)
     selection = select(graph, shortlists, config.selection)
     chosen = {entity: shortlists[entity][rank] for entity, rank in selection.chosen.items()}
@@ -165,7 +167,11 @@ def _default_shortlist() -> Shortlist:
 
 
 def _shortlists(
-    graph: ContactGraph, shortlist: Shortlist, say: Progress, notes: list[Note]
+    graph: ContactGraph,
+    shortlist: Shortlist,
+    known: Mapping[str, Sequence[CadCandidate]],
+    say: Progress,
+    notes: list[Note],
 ) -> dict[str, Sequence[CadCandidate]]:
     """Candidates of every entity but layout, parents before children; its own mesh for what has none."""
     out: dict[str, Sequence[CadCandidate]] = {}
@@ -173,6 +179,9 @@ def _shortlists(
     for number, name in enumerate(entities):
         say(f"matching {name}", 0.8 * number / len(entities))
         node = graph.nodes[name]
+        if known.get(name):
+            out[name] = known[name]
+            continue
         try:
             found = tuple(shortlist(node, graph, cad_models(node.semantic_class)))
             if not found:
@@ -180,9 +189,9 @@ def _shortlists(
                 notes.append(Note(NoteCode.NO_CANDIDATE, name, message))
         except UnknownNameError:
             found = ()
-            known = ", ".join(cad_classes())
+            classes = ", ".join(cad_classes())
             message = f"there is no model of the class '{node.semantic_class}'; its own mesh stands for it"
-            notes.append(Note(NoteCode.NO_MODEL, name, f"{message} (classes: {known})"))
+            notes.append(Note(NoteCode.NO_MODEL, name, f"{message} (classes: {classes})"))
         out[name] = found or _own(node, notes)
     return out
 
