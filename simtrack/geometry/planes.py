@@ -29,8 +29,9 @@ class PlaneConfig:
     """Metres: the same for entities however thin."""
     iterations: int = 200
     """Hypotheses a plane."""
-    min_fraction: float = 0.1
-    """Share of the remaining surface that a plane has to explain, or no more planes are looked for."""
+    min_fraction: float = 0.05
+    """Share of the remaining surface that a plane has to explain, or no more planes are looked for; 0.1 in the public
+    code, with which a shelf of five boards may have no plane at all."""
     min_share: float = 0.01
     """Share of the whole surface, likewise."""
     samples: int = 2000
