@@ -47,6 +47,8 @@ class ContactConfig:
     """Free height below what hangs."""
     hang_slender: float = 0.55
     """Largest depth of what hangs, in terms of the smaller of width and height, where its underside was not seen."""
+    hang_bare: float = 0.5
+    """Share of the wall right below a child that has to be seen: what is bare there holds no more of the child."""
     touch: float = 0.015
     """Between what leans and what it leans against."""
     lean_angle: float = float(np.radians(4.0))
@@ -59,7 +61,7 @@ class ContactConfig:
     def __post_init__(self) -> None:
         if not -1.0 <= self.level < 0.0:
             raise InvalidValueError("ContactConfig.level", self.level, "a cosine in [-1, 0)")
-        for name in ("contact_area", "weak_area", "inside", "within"):
+        for name in ("contact_area", "weak_area", "inside", "within", "hang_bare"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"ContactConfig.{name}", getattr(self, name), "a share in (0, 1]")
         for name in ("contact_gap", "sink", "margin", "hang_gap", "hang_clearance", "hang_slender", "touch"):
@@ -159,6 +161,8 @@ class HangOption:
     """Share of the child's side that faces the plane's extent."""
     slenderness: float
     """Depth of the child off the plane in terms of the smaller of its width and height; 0 for what hangs from above."""
+    bare: float = 0.0
+    """Share of the plane right below the child that was seen; 0 where the child is slender anyhow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,10 +294,24 @@ def _hang(child: Posed, parent: Posed, config: ContactConfig) -> HangOption | No
             area, slender = _Look(child).rectangle(*parent.plane_hull(k))[1], 0.0
         else:
             area, slender = _facing(child, parent, k, float(np.ptp(off)))
-        option = HangOption(k, float(off.min()), min(area, 1.0), slender)
+        bare = _bare(child, parent, k, config) if slender > config.hang_slender and area >= config.contact_area else 0.0
+        option = HangOption(k, float(off.min()), min(area, 1.0), slender, bare)
         if area >= config.contact_area and (best is None or (option.area, -option.gap) > (best.area, -best.gap)):
             best = option
     return best
+
+
+def _bare(child: Posed, parent: Posed, plane: int, config: ContactConfig) -> float:
+    """Share of an upright plane that was seen within `hang_clearance` below the middle of a child's width."""
+    n = parent.node.planes[plane].normal
+    across = np.array([-n[1], n[0], 0.0]) / np.hypot(n[0], n[1])
+    span = child.hull @ across
+    half = np.array([0.3 * np.ptp(span), 0.5 * config.hang_clearance])
+    middle = np.array([0.5 * (span.min() + span.max()), child.node.bottom - 0.02 - half[1], 0.0])
+    used, faces = np.unique(parent.faces_of(plane), return_inverse=True)
+    flat = np.stack([parent.vertices[used] @ across, parent.vertices[used, 2], np.zeros(len(used))], axis=1)
+    seen = covered(flat, faces.reshape(-1, 3).astype(np.int32), middle, 1.0, 0.0, half, 0.0, -1.0, 1.0)[1]
+    return min(float(seen) / float(4.0 * half[0] * half[1]), 1.0)
 
 
 def _facing(child: Posed, parent: Posed, plane: int, depth: float) -> tuple[float, float]:

@@ -37,6 +37,7 @@ from simtrack.objects.cad.materials import (
     Material,
 )
 from simtrack.objects.shapes import box, cylinder, rounded_plate
+from simtrack.simulation.building.rooms.fittings import board, picture, wall_cabinet, wall_shelf
 
 Family = Callable[[np.random.Generator], ModelBuilder]
 WOODS = (OAK, PINE, WALNUT, WHITE_BOARD)
@@ -337,9 +338,10 @@ def counter(rng: np.random.Generator) -> ModelBuilder:
 
 FAMILIES: Mapping[str, Family] = MappingProxyType(
     {
-        "bag": bag, "bed": bed, "book": book, "bottle": bottle, "bowl": bowl, "box": carton, "cabinet": cabinet,
-        "chair": chair, "counter": counter, "cup": cup, "fridge": fridge, "keyboard": keyboard, "microwave": microwave,
-        "monitor": monitor, "plant": plant, "sofa": sofa, "table": table,
+        "bag": bag, "bed": bed, "board": board, "book": book, "bottle": bottle, "bowl": bowl, "box": carton,
+        "cabinet": cabinet, "chair": chair, "counter": counter, "cup": cup, "fridge": fridge, "keyboard": keyboard,
+        "microwave": microwave, "monitor": monitor, "picture": picture, "plant": plant, "shelf": wall_shelf,
+        "sofa": sofa, "table": table, "wall cabinet": wall_cabinet,
     }
 )  # fmt: skip
-"""Name -> family; a ``counter`` is of the class ``cabinet``."""
+"""Name -> family; a ``counter`` and a ``wall cabinet`` are of the class ``cabinet``."""

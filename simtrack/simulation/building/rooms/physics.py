@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from simtrack.contracts import Int32
-from simtrack.geometry.meshes import Mesh, concatenate, transformed
+from simtrack.geometry.meshes import Mesh, box_mesh, concatenate, transformed
 from simtrack.geometry.transforms import inverse, quaternion_from_rotation, transform
 from simtrack.objects.cad.model import CadPart
 from simtrack.simulation.building.rooms.plan import PlacedModel, RoomKind, RoomPlan, plan_room
@@ -65,7 +65,9 @@ def settled_room(seed: int, kind: RoomKind | None = None) -> SettledRoom:
         if not unstable:
             return _truth(replace(plan, placed=placed), model, data, tuple(dropped))
         dropped += unstable
-        plan = replace(plan, placed=tuple(thing for thing in plan.placed if thing.name not in unstable))
+        placed = tuple(thing for thing in plan.placed if thing.name not in unstable)
+        cleats = tuple(cleat for cleat in plan.cleats if cleat.thing not in unstable)
+        plan = replace(plan, placed=placed, cleats=cleats)
 
 
 def compiled(plan: RoomPlan) -> "tuple[mujoco.MjModel, mujoco.MjData]":
@@ -88,6 +90,11 @@ def compiled(plan: RoomPlan) -> "tuple[mujoco.MjModel, mujoco.MjData]":
         centre = middle + (half + 0.1) * [x, y]
         size = [0.1 if x else half[0] + 0.2, 0.1 if y else half[1] + 0.2, plan.room.height / 2]
         spec.worldbody.add_geom(name=name, type=slab, pos=[*centre, plan.room.height / 2], size=size)
+    for cleat in plan.cleats:
+        for k, (T, extents) in enumerate(cleat.boxes):
+            quat = quaternion_from_rotation(T[:3, :3])
+            name = f"{cleat.wall}/{cleat.thing}#{k}"
+            spec.worldbody.add_geom(name=name, type=slab, pos=T[:3, 3], quat=quat, size=extents / 2)
     for thing in plan.placed:
         add_model(spec, thing)
     model = spec.compile()
@@ -150,7 +157,7 @@ def _settle(
         body = data.body(thing.name)
         T = transform(body.xmat.reshape(3, 3).copy(), body.xpos.copy())
         moved = inverse(thing.T_map_model) @ T
-        tilt = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
+        tilt = float(np.arccos(np.clip(T[:3, 2] @ thing.T_map_model[:3, 2], -1.0, 1.0)))
         if not (np.linalg.norm(moved[:3, 3]) < MAX_DRIFT and tilt < MAX_TILT):
             unstable.append(thing.name)
         positions = {
@@ -200,4 +207,5 @@ def _layout(plan: RoomPlan, name: str) -> Mesh:
             owner = WALLS[(1 if aside[0] > 0 else 3) if along_x else (2 if aside[1] > 0 else 0)]
         if owner == name:
             chosen.append(mesh)
+    chosen += [transformed(box_mesh(size), T) for each in plan.cleats if each.wall == name for T, size in each.boxes]
     return concatenate(chosen)

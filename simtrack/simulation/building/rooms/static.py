@@ -6,9 +6,10 @@ import numpy as np
 
 from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.meshes import transformed
+from simtrack.geometry.meshes import box_mesh, concatenate, transformed
 from simtrack.geometry.transforms import inverse, transform
 from simtrack.simulation.building.parts import StaticPart, StaticWorld, Support
+from simtrack.simulation.building.rooms.fittings import Cleat
 from simtrack.simulation.building.rooms.physics import RoomEntity, settled_room
 from simtrack.simulation.building.rooms.plan import KINDS
 
@@ -36,10 +37,30 @@ def room_world(seed: int, config: RoomConfig | None = None) -> StaticWorld:
         config: its kind.
     """
     config = RoomConfig() if config is None else config
-    kind = next((known for known in KINDS if known == config.kind), None)
+    kind = dict(zip(KINDS, KINDS, strict=True)).get(config.kind)
     room = settled_room(seed, kind)
     things = [entity for entity in room.entities if entity.placed is not None]
-    return StaticWorld((*room.plan.shell, *(_part(entity) for entity in things)), (room.plan.room,))
+    cleats = [_cleat_part(cleat) for cleat in room.plan.cleats]
+    return StaticWorld((*room.plan.shell, *cleats, *(_part(entity) for entity in things)), (room.plan.room,))
+
+
+def _cleat_part(cleat: Cleat) -> StaticPart:
+    """Rail and lip as a fixed part."""
+    mesh = concatenate([transformed(box_mesh(size), T) for T, size in cleat.boxes])
+    T_map_part = cleat.boxes[0][0].copy()
+    T_map_part[:3, 3] = mesh.bounds.mean(axis=0)
+    local = transformed(mesh, inverse(T_map_part))
+    return StaticPart(
+        name=f"{cleat.thing}-cleat",
+        semantic_class="wall",
+        mesh=local,
+        T_map_part=T_map_part,
+        extents=local.extents,
+        room="room",
+        survey="omitted",
+        collision=tuple((inverse(T_map_part) @ T, size) for T, size in cleat.boxes),
+        group="structure",
+    )
 
 
 def _part(entity: RoomEntity) -> StaticPart:

@@ -128,4 +128,5 @@ def _fused(
     used, faces = np.unique(corners, return_inverse=True)
     colors = None if mesh.face_colors is None else mesh.face_colors[kept]
     share = area(Mesh(mesh.vertices, mesh.faces[kept])) / area(mesh)
-    return SeenEntity(name, semantic_class, Mesh(vertices[used], faces.reshape(-1, 3), colors), float(share))
+    seen = Mesh(vertices[used], faces.reshape(-1, 3).astype(np.int32), colors)
+    return SeenEntity(name, semantic_class, seen, float(share))

@@ -34,7 +34,7 @@ def test_catalogue(semantic_class: str) -> None:
             assert deepest(model, joint.name, np.linspace(joint.lower, joint.upper, 8)) < 1e-4, (model.name, joint.name)
 
 
-@pytest.mark.parametrize("family", ["cabinet", "counter", "fridge", "microwave"])
+@pytest.mark.parametrize("family", ["cabinet", "counter", "fridge", "microwave", "wall cabinet"])
 def test_families(family: str) -> None:
     model = FAMILIES[family](np.random.default_rng(3)).finish(family)
     for joint in model.joints:
