@@ -16,7 +16,7 @@ from simtrack.geometry.transforms import inverse, transform
 from simtrack.objects.cad.model import CadJoint, CadPart
 from simtrack.perception.reconstruction.body_tree import Body, BodyJoint, BodyTree, JointKind, Shape
 from simtrack.perception.reconstruction.candidates import CadCandidate
-from simtrack.perception.reconstruction.layout import layout_mesh, layout_slabs, used_planes
+from simtrack.perception.reconstruction.layout import layout_mesh, layout_slabs
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
 from simtrack.perception.scene_graph.contact.nodes import SCENE
 
@@ -55,7 +55,7 @@ def kinematic_tree(
         parent = of_entity[graph.supports[entity].parent]
         if is_layout(node):
             joint = BodyJoint(f"{body_name}/fixed", "fixed", parent, inverse(poses[parent]))
-            shapes = tuple(Shape("convex", mesh=slab) for slab in layout_slabs(node, used_planes(graph, entity)))
+            shapes = tuple(Shape("convex", mesh=slab.mesh) for slab in layout_slabs(graph, entity))
             poses[body_name] = np.eye(4)
             bodies.append(
                 Body(body_name, joint, layout_mesh(node), shapes, friction=LAYOUT_FRICTION,

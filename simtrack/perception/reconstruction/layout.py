@@ -4,7 +4,7 @@ A slab lies behind a plane, under the convex outline of what was seen on it: fur
 Doors and windows are closed by it, as far as collisions are concerned.
 """
 
-from collections.abc import Collection
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from simtrack.contracts import Float64
 from simtrack.geometry.meshes import Mesh, convex_hull, decimate, transformed
 from simtrack.geometry.planes import SurfacePlane
 from simtrack.geometry.transforms import apply
-from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_layout
 from simtrack.perception.scene_graph.contact.nodes import EntityNode
 
 DEPTH = 0.1
@@ -24,23 +24,37 @@ LEVEL = np.cos(np.radians(3.0))
 SHOWN_FACES = 20_000
 
 
-def layout_slabs(node: EntityNode, used: Collection[int] = ()) -> tuple[Mesh, ...]:
-    """Convex slabs behind the largest plane of a layout node and behind those that support something (`used`), map.
+@dataclass(frozen=True, slots=True, eq=False)
+class Slab:
+    """A part of the layout that collides."""
 
-    One whose mesh has no plane has its box.
+    mesh: Mesh
+    """Closed and convex, in the map."""
+    normal: Float64
+    """(3,), unit: where the room is."""
+
+
+def layout_slabs(graph: ContactGraph, name: str) -> tuple[Slab, ...]:
+    """Slabs behind the planes of a layout node: those that support something and the main one.
+
+    The main one is the largest that looks at the middle of the scene (a wall may be known from both sides). A node
+    whose mesh has no plane has its box.
     """
-    if node.shape is None or not node.planes:
-        return (convex_hull(node.box.corners),)
-    outlines = node.shape.outlines
-    largest = max(range(len(outlines)), key=lambda k: node.planes[k].area, default=None)
-    chosen = {k for k in used if 0 <= k < len(outlines)} | (set() if largest is None else {largest})
-    slabs = [_slab(node.planes[k], apply(node.T_map_entity, outlines[k])) for k in sorted(chosen)]
-    return tuple(slabs) if slabs else (convex_hull(node.box.corners),)
+    node = graph.nodes[name]
+    outlines = () if node.shape is None else node.shape.outlines
+    if not outlines:
+        return (Slab(convex_hull(node.box.corners), node.box.T_map_box[:3, int(np.argmin(node.box.extents))]),)
+    middle = _middle(graph)
+    towards = [k for k in range(len(outlines)) if float(node.planes[k].distance(middle[None])[0]) > 0.0]
+    chosen = {s.plane for s in graph.supports.values() if s.parent == name and 0 <= s.plane < len(outlines)}
+    chosen.add(max(towards or range(len(outlines)), key=lambda k: node.planes[k].area))
+    return tuple(_slab(node.planes[k], apply(node.T_map_entity, outlines[k])) for k in sorted(chosen))
 
 
-def used_planes(graph: ContactGraph, name: str) -> set[int]:
-    """Indices of the planes of a node that something stands on or hangs on."""
-    return {s.plane for s in graph.supports.values() if s.parent == name and s.kind is not SupportKind.ROOT}
+def _middle(graph: ContactGraph) -> Float64:
+    """(3,) middle of the boxes of all that is no layout; of all, if there is nothing else."""
+    things = [node for node in graph.nodes.values() if not is_layout(node)] or list(graph.nodes.values())
+    return np.mean([node.box.T_map_box[:3, 3] for node in things], axis=0)
 
 
 def layout_mesh(node: EntityNode) -> Mesh | None:
@@ -50,7 +64,7 @@ def layout_mesh(node: EntityNode) -> Mesh | None:
     return decimate(transformed(node.shape.mesh, node.T_map_entity), SHOWN_FACES)
 
 
-def _slab(plane: SurfacePlane, outline: Float64) -> Mesh:
+def _slab(plane: SurfacePlane, outline: Float64) -> Slab:
     normal, centre = plane.normal, outline.mean(axis=0)
     if abs(normal[2]) > LEVEL:
         normal = np.array([0.0, 0.0, np.sign(normal[2])])
@@ -62,4 +76,4 @@ def _slab(plane: SurfacePlane, outline: Float64) -> Mesh:
     away = outline - centre
     length = np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
     grown = outline + away / length * MARGIN
-    return convex_hull(np.concatenate([grown, grown - DEPTH * normal]))
+    return Slab(convex_hull(np.concatenate([grown, grown - DEPTH * normal])), normal)

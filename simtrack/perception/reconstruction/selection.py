@@ -15,9 +15,10 @@ from simtrack.errors import InvalidValueError
 from simtrack.geometry.boxes import OrientedBox
 from simtrack.geometry.transforms import transform
 from simtrack.perception.reconstruction.candidates import CadCandidate, PlacedSupport
-from simtrack.perception.reconstruction.layout import layout_slabs, used_planes
-from simtrack.perception.reconstruction.solids import Solid, overlap, solid_of
+from simtrack.perception.reconstruction.layout import layout_slabs
+from simtrack.perception.reconstruction.solids import Solid, depth_along, overlap, solid_of
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
+from simtrack.perception.scene_graph.contact.nodes import FLOOR
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,8 @@ def select(
     config = config or SelectionConfig()
     out = Selection()
     solids = {name: [solid_of(candidate) for candidate in found] for name, found in shortlists.items() if found}
-    kept = {name: _kept(graph, name, shortlists[name], solids[name], config, out) for name in solids}
+    layout = _upright_layout(graph)
+    kept = {name: _kept(graph, name, shortlists[name], solids[name], layout, config, out) for name in solids}
     _min_conflicts(graph, kept, solids, config, out)
     for name, ranks in kept.items():
         for rank in ranks:
@@ -97,13 +99,14 @@ def _kept(
     name: str,
     candidates: Sequence[CadCandidate],
     solids: Sequence[Solid],
+    layout: Sequence[tuple[Solid, Float64]],
     config: SelectionConfig,
     out: Selection,
 ) -> list[int]:
     """Ranks that survive; if none does, those that keep most children, of them those least deep in layout."""
     children = [c for c in graph.children(name) if graph.supports[c].kind in (SupportKind.ON, SupportKind.INSIDE)]
     dropped = [[c for c in children if not supports_child(y, graph, c, config)] for y in candidates]
-    depths = [_layout_depth(solid, graph) for solid in solids]
+    depths = [max((depth_along(solid, slab, normal) for slab, normal in layout), default=0.0) for solid in solids]
     fewest = min(len(names) for names in dropped)
     able = [k for k, names in enumerate(dropped) if len(names) == fewest]
     least = max(min(depths[k] for k in able), config.wall_depth)
@@ -165,16 +168,10 @@ def _rectangle(T: Float64, size: Float64) -> Float64:
     return corners @ T[:2, :2].T + T[:2, 3]
 
 
-def _layout_depth(solid: Solid, graph: ContactGraph) -> float:
-    """How deep a solid is in walls and ceilings, metres; floors are a matter of support."""
-    deepest = 0.0
-    for node in graph.nodes.values():
-        if not is_layout(node) or node.semantic_class == "floor":
-            continue
-        for slab in layout_slabs(node, used_planes(graph, node.name)):
-            volume, depth = overlap(solid, Solid.of([slab.vertices]))
-            deepest = max(deepest, depth) if volume > 0.0 else deepest
-    return deepest
+def _upright_layout(graph: ContactGraph) -> list[tuple[Solid, Float64]]:
+    """Slabs, and where the room is (3,), of walls and ceilings; floors are a matter of support."""
+    names = [node.name for node in graph.nodes.values() if is_layout(node) and node.semantic_class != FLOOR]
+    return [(Solid.of([slab.mesh.vertices]), slab.normal) for name in names for slab in layout_slabs(graph, name)]
 
 
 # --------------------------------------------------------------------------------------------------------------- search

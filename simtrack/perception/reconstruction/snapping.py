@@ -17,7 +17,7 @@ from simtrack.geometry.transforms import transform
 from simtrack.perception.reconstruction.candidates import CadCandidate
 from simtrack.perception.reconstruction.interference import Contact, Interference
 from simtrack.perception.reconstruction.kinematic_tree import FIXED_CLASSES, scaled_mass
-from simtrack.perception.reconstruction.layout import layout_slabs, used_planes
+from simtrack.perception.reconstruction.layout import layout_slabs
 from simtrack.perception.reconstruction.selection import best_face
 from simtrack.perception.reconstruction.solids import Solid, resting_rise, solid_of
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
@@ -88,8 +88,8 @@ class _Snapping:
         self.start = {name: solid_of(chosen[name]) for name in self.order}
         for node in graph.nodes.values():
             if is_layout(node):
-                slabs = layout_slabs(node, used_planes(graph, node.name))
-                self.start[node.name] = Solid.of([slab.vertices for slab in slabs])
+                slabs = layout_slabs(graph, node.name)
+                self.start[node.name] = Solid.of([slab.mesh.vertices for slab in slabs])
         self.shifts = {name: np.zeros(3) for name in self.start}
         self.afloat: set[str] = set()
         self.ancestors = {name: self._above(name) for name in self.order}

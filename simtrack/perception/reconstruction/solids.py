@@ -78,6 +78,17 @@ def overlap(first: Solid, second: Solid) -> tuple[float, float]:
     return total, depth
 
 
+def depth_along(first: Solid, second: Solid, direction: Float64) -> float:
+    """Largest extent of a common piece of two solids along a unit vector (3,), metres; 0 if they are apart."""
+    gap = np.maximum(first.low[:, None] - second.high[None], second.low[None] - first.high[:, None]).max(axis=2)
+    deepest = 0.0
+    for i, j in np.argwhere(gap < -_CLOSE).tolist():
+        common = (_manifold(first.pieces[i]) ^ _manifold(second.pieces[j])).to_mesh64()
+        if len(common.tri_verts):
+            deepest = max(deepest, float(np.ptp(np.asarray(common.vert_properties)[:, :3] @ direction)))
+    return deepest
+
+
 class _Key:
     """An array as a key of a cache, by identity; keeps it alive."""
 

@@ -1,0 +1,63 @@
+"""Global check: what cannot carry, stands in a wall or in others, is not taken."""
+
+import pytest
+from corner import at, block, corner, table_mesh, table_model
+
+from simtrack.errors import InvalidValueError
+from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.selection import SelectionConfig, select
+from simtrack.perception.scene_graph.contact import ContactGraph
+
+WIDE, NARROW = table_model("table-wide", (1.0, 0.6, 0.7)), table_model("table-narrow", (0.3, 0.6, 0.7))
+
+
+def laid_table() -> ContactGraph:
+    """A table with a box near its end."""
+    return corner(
+        table=("table", table_mesh((1.0, 0.6, 0.7), (0.0, 0.0, 0.0))),
+        box=("box", block((0.2, 0.2, 0.1), (0.35, 0.0, 0.7))),
+    )
+
+
+def test_a_table_that_ends_before_what_stands_on_it_is_discarded() -> None:
+    offered = [CadCandidate(NARROW, at(0.0, 0.0, 0.35), 1.0), CadCandidate(WIDE, at(0.0, 0.0, 0.35), 1.0)]
+    selection = select(laid_table(), {"table": offered})
+    assert selection.chosen == {"table": 1}
+    assert "cannot support box (Eq. 2)" in selection.rejected["table"][0].reason
+    assert selection.lost == {}
+
+
+def test_if_none_carries_all_the_one_that_carries_most_is_kept_and_said() -> None:
+    selection = select(laid_table(), {"table": [CadCandidate(NARROW, at(0.0, 0.0, 0.35), 1.0)]})
+    assert selection.chosen == {"table": 0}
+    assert selection.lost == {"table": ["box"]}
+
+
+def test_what_stands_in_a_wall_is_discarded() -> None:
+    graph = corner(table=("table", table_mesh((1.0, 0.6, 0.7), (0.0, 1.7, 0.0))))
+    offered = [CadCandidate(WIDE, at(0.0, 1.81, 0.35), 1.0), CadCandidate(WIDE, at(0.0, 1.69, 0.35), 1.0)]
+    selection = select(graph, {"table": offered})
+    assert selection.chosen == {"table": 1}
+    assert "in layout" in selection.rejected["table"][0].reason
+
+
+def test_candidates_are_selected_to_stay_out_of_each_other() -> None:
+    graph = corner(
+        first=("table", table_mesh((0.9, 0.6, 0.7), (-0.5, 0.0, 0.0))),
+        second=("table", table_mesh((0.9, 0.6, 0.7), (0.5, 0.0, 0.0))),
+    )
+    offered = {
+        "first": [CadCandidate(WIDE, at(-0.45, 0.0, 0.35), 1.0), CadCandidate(WIDE, at(-0.55, 0.0, 0.35), 1.0)],
+        "second": [CadCandidate(WIDE, at(0.45, 0.0, 0.35), 1.0)],
+    }
+    selection = select(graph, offered)
+    assert selection.chosen == {"first": 1, "second": 0}
+    assert selection.conflicts == []
+    only = select(graph, {**offered, "first": offered["first"][:1]})
+    assert [(first, second) for first, second, _ in only.conflicts] == [("first", "second")]
+
+
+@pytest.mark.parametrize("field", [{"contact_area": 0.0}, {"steps": -1}, {"height": float("nan")}])
+def test_settings_out_of_range_are_refused(field: dict) -> None:
+    with pytest.raises(InvalidValueError, match=next(iter(field))):
+        SelectionConfig(**field)
