@@ -8,6 +8,7 @@ import simtrack
 from simtrack.cli import console
 from simtrack.cli.bench import bench
 from simtrack.cli.check import check
+from simtrack.cli.evaluate import evaluate
 from simtrack.cli.generate import generate
 from simtrack.cli.inspect import inspect
 from simtrack.cli.objects import objects
@@ -30,6 +31,7 @@ VERBS = {
     "scenes": scenes,
     "objects": objects,
     "query": query,
+    "evaluate": evaluate,
     "trials": trials,
     "bench": bench,
 }
