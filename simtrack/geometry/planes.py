@@ -29,9 +29,10 @@ class PlaneConfig:
     """Metres: the same for entities however thin."""
     iterations: int = 200
     """Hypotheses a plane."""
-    min_fraction: float = 0.05
-    """Share of the remaining surface that a plane has to explain, or no more planes are looked for; 0.1 in the public
-    code, with which a shelf of five boards may have no plane at all."""
+    min_fraction: float = 0.1
+    """Share of the remaining surface that a plane has to explain, or no more planes are looked for."""
+    enough: float = 0.04
+    """Share of the whole surface that is enough anyhow: each side of a board of a shelf has about a twentieth."""
     min_share: float = 0.01
     """Share of the whole surface, likewise."""
     samples: int = 2000
@@ -46,7 +47,7 @@ class PlaneConfig:
         for name in ("distance", "least_distance", "iterations", "samples", "normal_angle", "mean_angle", "max_planes"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"PlaneConfig.{name}", getattr(self, name), "a positive finite number")
-        for name in ("min_fraction", "min_share"):
+        for name in ("min_fraction", "enough", "min_share"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InvalidValueError(f"PlaneConfig.{name}", getattr(self, name), "a share in (0, 1)")
 
@@ -108,15 +109,22 @@ def detect_planes(
     left = np.ones(len(points), bool)
     free = np.ones(len(mesh.faces), bool)
     planes: list[SurfacePlane] = []
+    small = False
     while len(planes) < config.max_planes:
         rows = np.flatnonzero(left)
         if len(rows) < max(3.0, config.min_share * len(points)):
             break
         normal, offset, inliers = _best(points[rows], smooth[rows], limit, rng, config)
-        if len(inliers) < max(3.0, config.min_fraction * len(rows), config.min_share * len(points)):
+        least = min(config.min_fraction * len(rows), config.enough * len(points))
+        if len(inliers) < max(3.0, least, config.min_share * len(points)):
             break
         left[rows[inliers]] = False
-        if smooth[rows[inliers]].mean(axis=0) @ normal < np.cos(config.mean_angle):
+        facing = smooth[rows[inliers]] @ normal
+        small = small or len(inliers) < config.min_fraction * len(rows)
+        if small:  # from now on they have to be flat as far as their faces reach: else the caps of a ball were planes
+            facing = smooth[np.abs(points @ normal + offset) <= 2.0 * limit] @ normal
+            facing = facing[facing > 0.5]
+        if facing.mean() < np.cos(config.mean_angle):
             continue
         faces = _faces_on(mesh, normals, normal, offset, 2.0 * limit, free)
         free[faces] = False
