@@ -161,7 +161,7 @@ def reconstruct(
 
 
 def _default_shortlist() -> Shortlist:
-    from simtrack.perception.reconstruction.alignment import shortlist
+    from simtrack.perception.reconstruction.shortlist import shortlist
 
     return shortlist
 

@@ -1,0 +1,154 @@
+"""Matching and alignment of an entity in one call: sections 4.2 and 4.3 of the reconstruction paper.
+
+    candidates = shortlist(node, graph, cad_models(node.semantic_class))
+
+Beyond the paper, all of it named where it happens: upright models come before tipped ones, which must fit far better;
+the error that ranks looks at the directions in which surfaces face, at what the model has and the entity has not, and
+at whether the front could be used.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from simtrack.contracts import Float64
+from simtrack.errors import InvalidValueError
+from simtrack.objects.cad import CadModel
+from simtrack.perception.reconstruction.alignment import AlignmentConfig
+from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.fitting import SIDES, EntityView, Fit, coarse_fit, refined, with_open_joints
+from simtrack.perception.reconstruction.matching import UPRIGHT, MatchingConfig, matches
+from simtrack.perception.scene_graph.contact import ContactGraph, EntityKind, EntityNode
+
+_WALL_AREA = 0.5
+"""Square metres of the planes that count as walls."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShortlistConfig:
+    """Settings of `shortlist`."""
+
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
+    upright: int = 40
+    """Upright matches of lowest ME that are aligned coarsely."""
+    tipped: int = 3
+    """Other matches of lowest ME, likewise."""
+    advantage: float = 0.4
+    """Share of the best upright candidate's error below which a tipped one goes before it: things stand as they are
+    made to."""
+    blocked_front: float = 1.5
+    """Factor on the error of a candidate whose front faces a wall: nobody could use it."""
+    access: float = 0.3
+    """Metres that a front needs to a wall."""
+    unseen_front: float = 0.3
+    """Factor, added to 1, on the error of a candidate whose front nobody saw where its rear was seen: rears stand
+    against walls."""
+    opened: int = 3
+    """Candidates of articulated models for which open positions of the joints are tried."""
+
+    def __post_init__(self) -> None:
+        for name in ("upright", "tipped", "opened", "access", "unseen_front"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InvalidValueError(f"ShortlistConfig.{name}", getattr(self, name), "0 or more")
+        if not 0.0 < self.advantage <= 1.0 or not 1.0 <= self.blocked_front < np.inf:
+            allowed = "a share in (0, 1], and a factor of 1 or more"
+            raise InvalidValueError("ShortlistConfig.advantage, blocked_front", self, allowed)
+
+
+def shortlist(
+    node: EntityNode,
+    graph: ContactGraph,
+    models: Sequence[CadModel],
+    config: ShortlistConfig | None = None,
+    top: int = 10,
+) -> tuple[CadCandidate, ...]:
+    """Aligned models that could stand for an entity, the best one first.
+
+    Args:
+        node: the entity, with its box refined as in a finished graph.
+        graph: that it belongs to: what supports it, what it supports, walls.
+        models: of its class; none gives no candidates.
+        config: settings.
+        top: how many candidates at most.
+
+    Returns:
+        Candidates by rising error of `ranking_error`; none for layout and for nodes without a mesh.
+    """
+    config = config or ShortlistConfig()
+    if not models or top < 1 or node.kind is EntityKind.LAYOUT or node.shape is None:
+        return ()
+    view = EntityView.of(node, graph, config.alignment.samples)
+    free = front_clearances(view, graph)
+    fits = [
+        coarse_fit(view, match, config.alignment)
+        for upright, count in ((True, config.upright), (False, config.tipped))
+        for match in matches(node, graph, models, config.matching, count, upright=upright)
+    ]
+    ranked = _ranked(fits, view, free, config)[:top]
+    ranked = _ranked([refined(view, fit, config.alignment) for fit in ranked], view, free, config)
+    if node.kind is EntityKind.ARTICULATED:
+        opened = [with_open_joints(view, fit, config.alignment) for fit in ranked[: config.opened]]
+        ranked = _ranked([*opened, *ranked[config.opened :]], view, free, config)
+    return tuple(_candidate(view, fit) for fit in ranked)
+
+
+def _ranked(fits: Sequence[Fit], view: EntityView, free: Float64, config: ShortlistConfig) -> list[Fit]:
+    errors = {id(fit): ranking_error(fit, view, free, config) for fit in fits}
+    return sorted(fits, key=lambda fit: errors[id(fit)])
+
+
+def ranking_error(fit: Fit, view: EntityView, free: Float64, config: ShortlistConfig) -> float:
+    """What candidates are sorted by: the error of the surfaces, raised where the pose is no way to put such a thing.
+
+    Args:
+        fit: an aligned model.
+        view: the entity.
+        free: (4,) metres from each of `SIDES` to a wall.
+        config: the factors.
+    """
+    error = fit.error
+    if fit.match.orientation not in UPRIGHT:
+        return error / config.advantage
+    if len(fit.match.model.yaw_symmetries) > 1 and np.ptp(np.abs(fit.match.model.yaw_symmetries)) > 3.0:
+        return error  # front and rear are alike
+    side = int(np.argmax(SIDES @ -fit.T_box_model[:2, 1]))
+    if free[side] < config.access <= free[(side + 2) % 4]:
+        error *= config.blocked_front
+    front, rear = view.facing_sides[side], view.facing_sides[(side + 2) % 4]
+    return error * (1.0 + config.unseen_front * max(0.0, rear - front) / max(rear + front, 1e-9))
+
+
+def front_clearances(view: EntityView, graph: ContactGraph) -> Float64:
+    """(4,) metres from each of the upright sides of the box to the wall before it; inf where there is none."""
+    T, half = view.node.box.T_map_box, 0.5 * view.extents
+    directions = np.column_stack([SIDES, np.zeros(4)]) @ T[:3, :3].T
+    middles = T[:3, 3] + (np.abs(SIDES) @ half[:2])[:, None] * directions
+    free = np.full(4, np.inf)
+    for wall in graph.nodes.values():
+        if wall.kind is not EntityKind.LAYOUT or wall.shape is None:
+            continue
+        for plane, outline in zip(wall.planes, wall.shape.outlines, strict=False):
+            facing = np.flatnonzero((directions @ plane.normal < -0.7) & (plane.area > _WALL_AREA))
+            for side in facing if abs(plane.normal[2]) < 0.1 else ():
+                distance = float(plane.distance(middles[side]))
+                at = middles[side] - distance * plane.normal
+                corners = outline @ wall.T_map_entity[:3, :3].T + wall.T_map_entity[:3, 3]
+                if (at[:2] >= corners[:, :2].min(axis=0) - 0.05).all() and (
+                    at[:2] <= corners[:, :2].max(axis=0) + 0.05
+                ).all():
+                    free[side] = min(free[side], max(distance, 0.0))
+    return free
+
+
+def _candidate(view: EntityView, fit: Fit) -> CadCandidate:
+    return CadCandidate(
+        model=fit.match.model,
+        T_map_model=view.node.box.T_map_box @ fit.T_box_model,
+        scale=fit.scale,
+        positions=dict(fit.surface.positions),
+        matching_error=fit.match.error,
+        alignment_error=view.alignment_error(fit),
+        orientation=fit.match.orientation,
+    )
