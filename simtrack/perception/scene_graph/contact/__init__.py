@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         entity_nodes,
         entity_shape,
     )
+    from simtrack.perception.scene_graph.contact.tracked import TrackedContacts, TrackedContactsConfig
 
 _HOME = {
     "builder": ("ContactGraphBuilder", "build_contact_graph"),
@@ -55,6 +56,7 @@ _HOME = {
         "entity_nodes",
         "entity_shape",
     ),
+    "tracked": ("TrackedContacts", "TrackedContactsConfig"),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
 
@@ -74,6 +76,8 @@ __all__ = [
     "ProximalEdge",
     "Support",
     "SupportKind",
+    "TrackedContacts",
+    "TrackedContactsConfig",
     "build_contact_graph",
     "entity_node",
     "entity_nodes",
