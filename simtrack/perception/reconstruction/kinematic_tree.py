@@ -33,7 +33,11 @@ ROOT = "scene"
 
 
 def kinematic_tree(
-    name: str, graph: ContactGraph, chosen: Mapping[str, CadCandidate], ground: float | None = None
+    name: str,
+    graph: ContactGraph,
+    chosen: Mapping[str, CadCandidate],
+    ground: float | None = None,
+    parts: Mapping[str, str] | None = None,
 ) -> BodyTree:
     """The tree of a scene.
 
@@ -42,11 +46,13 @@ def kinematic_tree(
         graph: what supports what.
         chosen: entity -> its aligned model, for all entities but layout.
         ground: height in metres of a level ground that nobody saw; none if None.
+        parts: entity -> part of its supporter's model that it stands on; the base if it is not told.
     """
     taken: set[str] = set()
     root = Body(_unique(ROOT, taken), semantic_class="scene")
     bodies, of_entity = [root], {SCENE: root.name}
     poses = {root.name: np.eye(4)}
+    links: dict[tuple[str, str], str] = {}
     if ground is not None:
         bodies.append(_ground(_unique("ground", taken), root.name, ground))
     of_entity |= {entity: _unique(_printable(entity), taken) for entity in graph.descendants()}
@@ -65,9 +71,14 @@ def kinematic_tree(
         candidate = chosen[entity]
         kind: JointKind = "floating" if is_free(graph, entity, candidate) else "fixed"
         T_map_base = np.asarray(candidate.T_map_model, float)
+        parent = links.get((graph.supports[entity].parent, (parts or {}).get(entity, "")), parent)
         joint = BodyJoint(f"{body_name}/{kind}", kind, parent, inverse(poses[parent]) @ T_map_base)
-        poses[body_name] = T_map_base
-        bodies += _bodies_of(candidate, body_name, joint, node.semantic_class, taken)
+        made = _bodies_of(candidate, body_name, joint, node.semantic_class, taken)
+        bodies += made
+        for part, body in zip(_parts_in_order(candidate), made, strict=True):
+            assert body.joint is not None
+            links[entity, part] = body.name
+            poses[body.name] = poses[body.joint.parent] @ body.joint.T_parent_body
     return BodyTree(_printable(name), tuple(bodies))
 
 
@@ -82,6 +93,11 @@ def is_free(graph: ContactGraph, entity: str, candidate: CadCandidate) -> bool:
 def scaled_mass(candidate: CadCandidate) -> float:
     """Kilograms of an aligned model: material grows with the cube of alpha."""
     return candidate.model.mass * candidate.scale**3
+
+
+def _parts_in_order(candidate: CadCandidate) -> list[str]:
+    """Names of the parts as `_bodies_of` makes bodies of them."""
+    return [candidate.model.parts[0].name, *(joint.child for joint in candidate.model.joints)]
 
 
 def _bodies_of(

@@ -138,6 +138,8 @@ def reconstruct(
     shortlists = _shortlists(graph, shortlist or _default_shortlist(), known or {}, say, notes)
     say("checking candidates against each other", 0.8)
     selection = select(graph, shortlists, config.selection)
+    if _offer_own_meshes(graph, shortlists, selection, say, notes):
+        selection = select(graph, shortlists, config.selection)
     chosen = {entity: shortlists[entity][rank] for entity, rank in selection.chosen.items()}
     _selection_notes(selection, notes)
     ground = _ground(graph, chosen, notes)
@@ -145,7 +147,7 @@ def reconstruct(
     snapped = snap(graph, chosen, config.snapping, ground)
     _snapping_notes(graph, snapped, notes)
     say("kinematic tree", 0.98)
-    tree = kinematic_tree(name, graph, snapped.candidates, ground)
+    tree = kinematic_tree(name, graph, snapped.candidates, ground, snapped.parts)
     choices = {
         entity: Choice(
             candidate=snapped.candidates[entity],
@@ -194,6 +196,27 @@ def _shortlists(
             notes.append(Note(NoteCode.NO_MODEL, name, f"{message} (classes: {classes})"))
         out[name] = found or _own(node, notes)
     return out
+
+
+def _offer_own_meshes(
+    graph: ContactGraph,
+    shortlists: dict[str, Sequence[CadCandidate]],
+    selection: Selection,
+    say: Progress,
+    notes: list[Note],
+) -> bool:
+    """Where no model has a place for what stands in an entity, its own mesh may have; whether any was added."""
+    found = False
+    for name, children in selection.homeless.items():
+        if not children or any(is_own(candidate) for candidate in shortlists[name]):
+            continue
+        say(f"decomposing {name}", 0.85)
+        own = _own(graph.nodes[name], notes)
+        shortlists[name] = (*shortlists[name], *own)
+        message = f"no model of its class has a place for {', '.join(children)}; its own mesh is tried"
+        notes.append(Note(NoteCode.NO_CANDIDATE, name, message))
+        found = found or bool(own)
+    return found
 
 
 def _own(node: EntityNode, notes: list[Note]) -> Sequence[CadCandidate]:

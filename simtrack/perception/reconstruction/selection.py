@@ -20,6 +20,11 @@ from simtrack.perception.reconstruction.solids import Solid, depth_along, overla
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
 from simtrack.perception.scene_graph.contact.nodes import FLOOR
 
+INNER = 0.8
+"""Sides of the part of a child's box, about its middle, that has to be free: models are not exactly alike."""
+MOST_TAKEN = 0.15
+"""Share of it that the model may take."""
+
 
 @dataclass(frozen=True, slots=True)
 class SelectionConfig:
@@ -27,8 +32,12 @@ class SelectionConfig:
 
     contact_area: float = 0.5
     """b_th of Eq. 2."""
+    weak_area: float = 0.2
+    """Share of a bottom on a face from which a child has at least a place there."""
     height: float = 0.12
     """How far a candidate's support may lie above or below where the child stands: snapping moves the child."""
+    far: float = 0.2
+    """The same for any place at all."""
     wall_depth: float = 0.06
     """How far a candidate may stand in layout: snapping pushes it out."""
     overlap_depth: float = 0.01
@@ -39,9 +48,10 @@ class SelectionConfig:
     """Of its random choices."""
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.contact_area <= 1.0:
-            raise InvalidValueError("SelectionConfig.contact_area", self.contact_area, "a share in (0, 1]")
-        for name in ("height", "wall_depth", "overlap_depth"):
+        for name in ("contact_area", "weak_area"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise InvalidValueError(f"SelectionConfig.{name}", getattr(self, name), "a share in (0, 1]")
+        for name in ("height", "far", "wall_depth", "overlap_depth"):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise InvalidValueError(f"SelectionConfig.{name}", getattr(self, name), "finite and >= 0")
         if self.steps < 0:
@@ -67,6 +77,8 @@ class Selection:
     rejected: dict[str, list[Rejection]] = field(default_factory=dict)
     lost: dict[str, list[str]] = field(default_factory=dict)
     """Entity -> children that its chosen candidate does not support as Eq. 2 asks."""
+    homeless: dict[str, list[str]] = field(default_factory=dict)
+    """Entity -> those of them that its candidate has no place for at all."""
     in_layout: dict[str, float] = field(default_factory=dict)
     """Entity -> depth in metres, where every candidate stands too deep in layout."""
     conflicts: list[tuple[str, str, float]] = field(default_factory=list)
@@ -105,7 +117,10 @@ def _kept(
 ) -> list[int]:
     """Ranks that survive; if none does, those that keep most children, of them those least deep in layout."""
     children = [c for c in graph.children(name) if graph.supports[c].kind in (SupportKind.ON, SupportKind.INSIDE)]
-    dropped = [[c for c in children if not supports_child(y, graph, c, config)] for y in candidates]
+    dropped = [
+        [c for c in children if place_of(y, solid, graph, c, config.height, config.contact_area) is None]
+        for y, solid in zip(candidates, solids, strict=True)
+    ]
     depths = [max((depth_along(solid, slab, normal) for slab, normal in layout), default=0.0) for solid in solids]
     fewest = min(len(names) for names in dropped)
     able = [k for k, names in enumerate(dropped) if len(names) == fewest]
@@ -120,16 +135,31 @@ def _kept(
         )
         out.rejected.setdefault(name, []).append(Rejection(k, candidate.model.name, reason))
     if fewest:
-        out.lost[name] = dropped[ranks[0]]
+        best = ranks[0]
+        out.lost[name] = dropped[best]
+        out.homeless[name] = [
+            c for c in dropped[best]
+            if place_of(candidates[best], solids[best], graph, c, config.far, config.weak_area) is None
+        ]  # fmt: skip
     if least > config.wall_depth:
         out.in_layout[name] = least
     return ranks
 
 
-def supports_child(candidate: CadCandidate, graph: ContactGraph, child: str, config: SelectionConfig) -> bool:
-    """Whether Eq. 2 holds for a candidate and a child's box, near where the child stands."""
-    box, height = graph.nodes[child].box, graph.supports[child].height
-    return best_face(candidate, box, height, config.height, config.contact_area) is not None
+def place_of(
+    candidate: CadCandidate, solid: Solid, graph: ContactGraph, child: str, reach: float, least: float
+) -> PlacedSupport | None:
+    """Where a child of the graph would stand on (or in) a candidate, and has room; None if nowhere.
+
+    Args:
+        candidate: for the child's parent.
+        solid: its pieces.
+        graph: where the child stands now.
+        child: its name.
+        reach: metres that the face may lie above or below.
+        least: A of Eq. 2 that is asked.
+    """
+    return best_face(candidate, graph.nodes[child].box, graph.supports[child].height, reach, least, solid)
 
 
 def standing_faces(candidate: CadCandidate) -> tuple[PlacedSupport, ...]:
@@ -142,16 +172,25 @@ def standing_faces(candidate: CadCandidate) -> tuple[PlacedSupport, ...]:
 
 
 def best_face(
-    candidate: CadCandidate, child: OrientedBox, height: float, reach: float, least: float
+    candidate: CadCandidate, child: OrientedBox, height: float, reach: float, least: float, solid: Solid
 ) -> PlacedSupport | None:
-    """The face nearest in height under at least a share of the child's bottom (A of Eq. 2); None if there is none."""
-    faces = standing_faces(candidate)
-    found = [
-        (abs(face.height - height), k)
-        for k, face in enumerate(faces)
-        if abs(face.height - height) <= reach and contact_share(child, face) >= least
-    ]
-    return faces[min(found)[1]] if found else None
+    """The face nearest to a height under at least a share of the child's bottom (A of Eq. 2) that has room above it.
+
+    None if there is none within `reach` metres.
+    """
+    near = [face for face in standing_faces(candidate) if abs(face.height - height) <= reach]
+    for face in sorted(near, key=lambda face: abs(face.height - height)):
+        if contact_share(child, face) >= least and _has_room(solid, child, face.height):
+            return face
+    return None
+
+
+def _has_room(solid: Solid, child: OrientedBox, height: float) -> bool:
+    """Whether the inner part of a child's box that is put at a height is nearly free of the solid."""
+    T = child.T_map_box.copy()
+    T[2, 3] = height + 0.5 * child.extents[2]
+    inner = OrientedBox(T, INNER * child.extents)
+    return overlap(solid, Solid.of([inner.corners]))[0] <= MOST_TAKEN * float(np.prod(inner.extents))
 
 
 def contact_share(child: OrientedBox, face: PlacedSupport) -> float:

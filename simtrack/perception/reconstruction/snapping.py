@@ -62,6 +62,8 @@ class Snapped:
     """Entity -> (3,) translation from where alignment had it, metres."""
     residuals: dict[str, float]
     """Entity -> D of Eq. 1 that is left, metres; of those that stand on something."""
+    parts: dict[str, str]
+    """Entity -> part of its supporter's model that it stands on, a drawer say; where the model tells."""
     afloat: list[str] = field(default_factory=list)
     """Entities below which there is nothing of their supporter."""
     stuck: list[tuple[str, str, float]] = field(default_factory=list)
@@ -92,6 +94,7 @@ class _Snapping:
                 self.start[node.name] = Solid.of([slab.mesh.vertices for slab in slabs])
         self.shifts = {name: np.zeros(3) for name in self.start}
         self.afloat: set[str] = set()
+        self.parts: dict[str, str] = {}
         self.ancestors = {name: self._above(name) for name in self.order}
         self.weight = {name: self._mobility(name) for name in self.start}
 
@@ -112,6 +115,7 @@ class _Snapping:
             candidates,
             {name: self.shifts[name] for name in self.order},
             {name: self._residual(name) for name in stands if name in candidates},
+            self.parts,
             sorted(self.afloat),
             [(c.first, c.second, c.depth) for c in stuck],
         )
@@ -137,8 +141,9 @@ class _Snapping:
             box = self.graph.nodes[name].box
             moved = OrientedBox(transform(None, self.shifts[name]) @ box.T_map_box, box.extents)
             at = height + self.shifts[parent][2]
-            face = best_face(self._placed(parent), moved, at, self.config.reach, LEAST_AREA)
+            face = best_face(self._placed(parent), moved, at, self.config.reach, LEAST_AREA, self._solid(parent))
             if face is not None:
+                self.parts[name] = face.part
                 solid = self._lift(name, face.height - solid.bottom)
         below = {p: self._solid(p) for p in self.graph.supporters(name) if p != SCENE and p in self.start}
         tall = float(solid.high[:, 2].max() - solid.bottom)
