@@ -211,7 +211,7 @@ def outcome(
     if report is not None and deciding is not None:
         limits = report.config
         bodies = tuple(
-            BodyOutcome(b.name, b.drift < limits.drift and b.tilt < limits.tilt, b.penetration_start, b.gap)
+            BodyOutcome(b.name, bool(b.drift < limits.drift and b.tilt < limits.tilt), b.penetration_start, b.gap)
             for b in deciding.bodies
             if not b.static
         )

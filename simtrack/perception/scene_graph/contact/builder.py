@@ -153,12 +153,13 @@ class ContactGraphBuilder:
     ) -> tuple[ProximalEdge, ...]:
         """Overlapping boxes of entities of which neither supports the other."""
         names = sorted(nodes)
-        centres = np.array([nodes[name].box.T_map_box[:3, 3] for name in names]).reshape(-1, 3)
-        radii = np.array([0.5 * np.linalg.norm(nodes[name].box.extents) for name in names])
-        gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2) - radii[:, None] - radii[None]
+        T = np.array([nodes[name].box.T_map_box for name in names]).reshape(-1, 4, 4)
+        half = np.array([0.5 * nodes[name].box.extents for name in names]).reshape(-1, 3)
+        reach = np.einsum("nij,nj->ni", np.abs(T[:, :3, :3]), half)
+        gaps = np.abs(T[:, None, :3, 3] - T[None, :, :3, 3]) - reach[:, None] - reach[None]
         holding = {frozenset((s.child, s.parent)) for s in (*supports.values(), *others)}
         edges = []
-        for i, j in np.argwhere(np.triu(gaps < 0.0, 1)):
+        for i, j in np.argwhere(np.triu((gaps < 0.0).all(axis=2), 1)):
             first, second = names[i], names[j]
             if frozenset((first, second)) in holding:
                 continue

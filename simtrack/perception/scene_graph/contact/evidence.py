@@ -89,10 +89,15 @@ class Posed:
         self._planes: dict[int, tuple[Float64, Int32]] = {}
         self._outline: tuple[Float64, Int32] | None = None
         self._underside: float | None = None
+        self._faces: dict[int, Int32] = {}
+        self.needs_hold: bool | None = None
+        """Whether it is tilted and would topple, once that is known; see `leaning`."""
 
     def faces_of(self, plane: int) -> Int32:
         """(K, 3) faces on one of the node's planes."""
-        return self.faces[self.node.planes[plane].faces]
+        if plane not in self._faces:
+            self._faces[plane] = self.faces[self.node.planes[plane].faces]
+        return self._faces[plane]
 
     def plane_outline(self, plane: int) -> Float64:
         """(K, 3) corners of the convex hull of what lies on a plane."""

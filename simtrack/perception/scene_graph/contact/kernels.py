@@ -60,10 +60,19 @@ def covered(vertices, faces, origin, cosine, sine, half, margin, low, high):
     b = np.empty((_CORNERS, 3))
     reach_x = half[0] + margin
     reach_y = half[1] + margin
+    around = np.sqrt(reach_x * reach_x + reach_y * reach_y)
     x0 = y0 = np.inf
     x1 = y1 = -np.inf
     area = 0.0
     for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        # most faces lie elsewhere: seen before they are turned
+        p, q, r = vertices[i, 0] - origin[0], vertices[j, 0] - origin[0], vertices[k, 0] - origin[0]
+        if min(p, q, r) > around or max(p, q, r) < -around:
+            continue
+        p, q, r = vertices[i, 1] - origin[1], vertices[j, 1] - origin[1], vertices[k, 1] - origin[1]
+        if min(p, q, r) > around or max(p, q, r) < -around:
+            continue
         _into(vertices, faces[f], origin, cosine, sine, a)
         if min(a[0, 2], a[1, 2], a[2, 2]) > high or max(a[0, 2], a[1, 2], a[2, 2]) < low:
             continue

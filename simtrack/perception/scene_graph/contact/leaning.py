@@ -17,11 +17,16 @@ def find_leaning(
     return tuple(
         lean
         for name, support in supports.items()
-        if support.kind in (SupportKind.ON, SupportKind.INSIDE)
-        and is_tilted(bodies[name], config)
-        and topples(bodies[name], config)
+        if support.kind in (SupportKind.ON, SupportKind.INSIDE) and _needs_hold(bodies[name], config)
         for lean in _against(name, bodies, supports, config)
     )
+
+
+def _needs_hold(body: Posed, config: ContactConfig) -> bool:
+    """Whether a body is tilted and would topple; kept with the body, since it depends on nothing else."""
+    if body.needs_hold is None:
+        body.needs_hold = is_tilted(body, config) and topples(body, config)
+    return body.needs_hold
 
 
 def is_tilted(body: Posed, config: ContactConfig) -> bool:

@@ -161,12 +161,11 @@ def _touching(
     hidden_by = {p for p in contacts if _hidden(p, child, contacts, seated, evidence, config)}
     hidden_by -= {p for p in hidden_by if any(_rests(p, q, evidence, config) for q in seated if q != p)}
     open_to = {parent: option for parent, option in contacts.items() if parent not in hidden_by}
-    balanced = _balanced(child, open_to.values())
     choices = []
     for parent, option in open_to.items():
         if parent in seated:
             rank = _Rank.SEATED
-        elif balanced or option.area >= config.weak_area:
+        elif option.area >= config.weak_area or _balanced(child, open_to.values()):
             rank = _Rank.BALANCED
         else:
             continue
