@@ -69,9 +69,9 @@ class SceneObject(Strict):
 
 
 class Static(Strict):
-    """What builds the static world."""
+    """What builds the static world; ``mjcf``: it is what is fixed in the scene's MJCF file."""
 
-    builder: Literal["lab_room", "office_floor", "room"]
+    builder: Literal["lab_room", "office_floor", "room", "mjcf"]
     config: dict[str, Any] = Field(default_factory=dict)
     """Fields of the builder's configuration."""
     seed: int | None = Field(default=None, ge=0)
@@ -263,13 +263,17 @@ def scene_names() -> dict[str, Path]:
 
 
 def load_scene(name_or_path: str | Path) -> SceneFile:
-    """Read a scene by name, or by the path of its folder or YAML file; ``NAME:SEED`` fixes the building's seed.
+    """Read a scene by name, or by the path of its folder, YAML or MJCF file; ``NAME:SEED`` fixes the building's seed.
 
     Raises `UnknownNameError` with the known scenes, `FileFormatError` with file, field and what is allowed.
     """
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml") and path.is_file():
         return read_scene(path)
+    if path.suffix == ".xml" and path.is_file():
+        from simtrack.simulation.mjcf_world import mjcf_scene
+
+        return mjcf_scene(path)
     if len(path.parts) > 1 and (path / FILE_NAME).is_file():
         return read_scene(path / FILE_NAME)
     known = scene_names()

@@ -1,6 +1,6 @@
 """A user's MJCF file as a part of the world: checked, attached under a prefix, its shapes seen by both renderers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
@@ -26,7 +26,12 @@ SEGMENTS = 96
 
 
 def attach(
-    spec: "mujoco.MjSpec", scene: SceneFile, show: Callable[["mujoco.MjsBody", str, Mesh, Float64], None]
+    spec: "mujoco.MjSpec",
+    scene: SceneFile,
+    show: Callable[["mujoco.MjsBody", str, Mesh, Float64], None],
+    *,
+    without: Collection[str] = (),
+    lowered: float = 0.0,
 ) -> None:
     """Attach the scene's MJCF file.
 
@@ -34,30 +39,49 @@ def attach(
         spec: the world that is being composed.
         scene: names the file.
         show: called with (body, name, mesh, T_body_mesh) for every visible shape.
+        without: names of bodies that are left out.
+        lowered: metres by which all of it is put lower.
 
     Raises:
         FileFormatError: broken XML, something that MuJoCo refuses, or a file outside of the scene's folder.
     """
-    import mujoco
-
     path = scene.mjcf_path
     assert path is not None
-    _check_files(path, scene.path.parent)
+    user, model = read_model(path, scene.path.parent, without)
+    for geom in user.geoms:
+        geom.group = COLLISION if geom.group <= 2 else geom.group
+    user.option.timestep = spec.option.timestep
+    shapes = [geom_shape(model, geom, path) for geom in range(model.ngeom) if model.geom_group[geom] <= 2]
+    spec.attach(user, prefix=PREFIX, frame=spec.worldbody.add_frame(pos=[0.0, 0.0, -lowered]))
+    for number, (body, mesh, T) in enumerate(shapes):
+        target = spec.worldbody if body == 0 else spec.body(PREFIX + model.body(body).name)
+        T = T if body else transform(None, (0.0, 0.0, -lowered)) @ T
+        show(target, f"{PREFIX}{model.body(body).name}#{number}", mesh, T)
+
+
+def read_model(path: Path, folder: Path, without: Collection[str] = ()) -> "tuple[mujoco.MjSpec, mujoco.MjModel]":
+    """A file as a spec in which every body has a name, and as a model.
+
+    Args:
+        path: the file.
+        folder: in which all files that it names must lie.
+        without: names of bodies that are left out.
+
+    Raises:
+        FileFormatError: see `attach`.
+    """
+    import mujoco
+
+    _check_files(path, folder.resolve())
     try:
         user = mujoco.MjSpec.from_file(str(path))
         for number, body in enumerate(user.bodies[1:]):
             body.name = body.name or f"body{number}"
-        model = user.compile()
+        for name in without:
+            user.delete(user.body(name))
+        return user, user.compile()
     except ValueError as error:
         raise FileFormatError(path, "", f"MuJoCo cannot use it: {error}") from error
-    for geom in user.geoms:
-        geom.group = COLLISION if geom.group <= 2 else geom.group
-    user.option.timestep = spec.option.timestep
-    shapes = [_shape(model, geom, path) for geom in range(model.ngeom) if model.geom_group[geom] <= 2]
-    spec.attach(user, prefix=PREFIX, frame=spec.worldbody.add_frame())
-    for number, (body, mesh, T) in enumerate(shapes):
-        target = spec.worldbody if body == 0 else spec.body(PREFIX + model.body(body).name)
-        show(target, f"{PREFIX}{model.body(body).name}#{number}", mesh, T)
 
 
 def _check_files(path: Path, folder: Path) -> None:
@@ -84,7 +108,7 @@ def _check_files(path: Path, folder: Path) -> None:
             _check_files(path.parent / element.get("file", ""), folder)
 
 
-def _shape(model: "mujoco.MjModel", geom: int, path: Path) -> tuple[int, Mesh, Float64]:
+def geom_shape(model: "mujoco.MjModel", geom: int, path: Path) -> tuple[int, Mesh, Float64]:
     """Body, coloured mesh and T_body_mesh (4, 4) of a compiled geom."""
     import mujoco
 

@@ -121,6 +121,13 @@ class _Composer:
         self.show(body, self.mesh(name, mesh), f"static/{name}", T)
         self.instances.append((name.rpartition("#")[0], "static", body.name, mesh, T))
 
+    def show_own_shape(self, body: "mujoco.MjsBody", name: str, mesh: Mesh, T: Float64) -> None:
+        """The same where the MJCF is the whole world: things have the names that they have there."""
+        from simtrack.simulation.user_mjcf import PREFIX
+
+        self.show(body, self.mesh(name, mesh), f"static/{name.removeprefix(PREFIX)}", T)
+        self.instances.append((name.removeprefix(PREFIX).rpartition("#")[0], "static", body.name, mesh, T))
+
     def finish(self) -> "mujoco.MjModel":
         """Compile; every face samples one texel, so that colours are exact and no texture is ever filtered."""
         import mujoco
@@ -162,11 +169,17 @@ def build_world(scene: SceneFile, seed: int, fovy: float = 0.79, image_size: tup
 
     composer = _Composer()
     _set_options(composer.spec, image_size)
-    _add_static(composer, static)
-    if scene.mjcf_path is not None:
+    if scene.static.builder == "mjcf":
+        from simtrack.simulation.mjcf_world import floor_height
         from simtrack.simulation.user_mjcf import attach
 
-        attach(composer.spec, scene, composer.show_user_shape)
+        attach(composer.spec, scene, composer.show_own_shape, without=models, lowered=floor_height(scene))
+    else:
+        _add_static(composer, static)
+        if scene.mjcf_path is not None:
+            from simtrack.simulation.user_mjcf import attach
+
+            attach(composer.spec, scene, composer.show_user_shape)
     for name, model in models.items():
         trackable = any(thing.id == name for thing in scene.objects)
         _add_object(composer, name, model, poses[name], "catalogue" if trackable else "clutter")
@@ -180,6 +193,10 @@ def build_world(scene: SceneFile, seed: int, fovy: float = 0.79, image_size: tup
 def build_static(scene: SceneFile, seed: int) -> StaticWorld:
     """The building of a scene; raises FileFormatError for a configuration that its builder does not take."""
     building_seed = seed if scene.static.seed is None else scene.static.seed
+    if scene.static.builder == "mjcf":
+        from simtrack.simulation.mjcf_world import mjcf_building
+
+        return mjcf_building(scene)
     if scene.static.builder == "room":
         from simtrack.simulation.building.rooms.static import RoomConfig, room_world
 

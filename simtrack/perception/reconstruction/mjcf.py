@@ -2,8 +2,8 @@
 
 MuJoCo cannot load floating joints below other bodies. Each component of the tree becomes a body of the world with its
 fixed and moving parts nested in it; ``custom/text`` elements named ``support:BODY`` hold the name of the supporting
-body. Contacts between the two sides of a joint are left out, as the shapes of doors overlap their frames at the hinge.
-Group 2 is seen, group 3 collides.
+body, those named ``class:BODY`` its semantic class. Contacts between the two sides of a joint are left out, as the
+shapes of doors overlap their frames at the hinge. Group 2 is seen, group 3 collides.
 """
 
 from pathlib import Path
@@ -37,11 +37,12 @@ def write_mjcf(tree: BodyTree, meshes: MeshFiles, path: Path) -> None:
     for component in tree.components:
         _component(world, component, meshes)
     _excludes(root, tree)
-    supported = [component for component in tree.components if component.support is not None]
-    if supported:
-        custom = SubElement(root, "custom")
-        for component in supported:
-            SubElement(custom, "text", name=f"support:{component.name}", data=component.support or "")
+    custom = SubElement(root, "custom")
+    for component in tree.components:
+        if component.support is not None:
+            SubElement(custom, "text", name=f"support:{component.name}", data=component.support)
+    for body in tree.bodies:
+        SubElement(custom, "text", name=f"class:{body.name}", data=body.semantic_class)
     ElementTree.indent(root)
     path.write_bytes(ElementTree.tostring(root, encoding="utf-8") + b"\n")
 
