@@ -25,6 +25,7 @@ class AlignmentConfig:
     """Settings of the alignment. Weights multiply residuals: they are the square roots of the diagonals of Sigma."""
 
     height_weight: float = 2.0
+    """Of the height relative to the entity's, in diagonals of its box: what is flat has a height too."""
     footprint_weight: float = 0.5
     plane_weight: float = 1.0
     """Of all planes together; each has the share that it has in their area."""
@@ -124,9 +125,10 @@ class AlignmentProblem:
         outside, slopes = footprint_outside(self.footprint, half, unknowns[2:], unknowns[1])
         tall = scale * self.extents[2]
         residuals[0], J[0] = unit * outside, unit * slopes
-        residuals[1], J[1] = config.height_weight * (tall - self.height), (config.height_weight * tall, 0.0, 0.0, 0.0)
         height, rise = self.centre_height(scale), 0.5 * tall if self.tied else 0.0
         diagonal = np.sqrt(sides @ sides + self.height**2)
+        unit = config.height_weight * diagonal / self.height
+        residuals[1], J[1] = unit * (tall - self.height), (unit * tall, 0.0, 0.0, 0.0)
         given = pairs.normals, pairs.offsets, pairs.model_normals, pairs.model_offsets
         end = 2 + 2 * count
         weights = config.plane_weight * pairs.weights

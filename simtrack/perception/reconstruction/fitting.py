@@ -27,8 +27,10 @@ OPENED = 0.97
 """Share of the error that an opened joint must not exceed to be believed."""
 SURPLUS = 0.5
 """Weight of what the model has and the entity has not."""
-SATURATION = 0.1
-"""Diagonals of the box beyond which a distance hardly counts for more."""
+PROPORTIONS = 0.3
+"""What a side of the box that is larger or smaller by a factor of e adds to the error, relative to it."""
+YAW_STARTS = (0.0, -np.pi / 6, np.pi / 6)
+"""Where the yaw of what is no box starts: its smallest box may be turned against it."""
 SPARSE = 3
 """Every how many-th point of a model is compared with the entity."""
 _OUTWARD = 0.7
@@ -78,6 +80,13 @@ class EntityView:
         depth = 0.5 * np.abs(SIDES) @ self.extents[:2] - self.surface.points[:, :2] @ SIDES.T
         near = depth < np.maximum(0.15 * np.abs(SIDES) @ self.extents[:2], 0.02)
         return (facing & near).sum(axis=0) < 0.01 * len(facing)
+
+    @cached_property
+    def boxy(self) -> bool:
+        """Whether most of the upright surface is parallel to the sides of the box."""
+        normals = self.surface.normals[np.abs(self.surface.normals[:, 2]) < 0.3]
+        parallel = np.abs(normals[:, :2] @ SIDES[:2].T).max(axis=1, initial=0.0) > np.cos(np.radians(12.0))
+        return len(normals) > 0.1 * len(self.surface.normals) and bool(parallel.mean() > 0.7)
 
     @cached_property
     def _tree(self) -> Any:
@@ -141,6 +150,10 @@ def refined(view: EntityView, fit: Fit, config: AlignmentConfig) -> Fit:
     """Align a model further with the points of the entity's surface, which find their counterparts anew in rounds."""
     problem = _problem(view, fit.match, config)
     unknowns = fit.unknowns
+    if not view.boxy:
+        starts = [unknowns + [0.0, turn, 0.0, 0.0] for turn in YAW_STARTS]
+        turned = [_rated(view, fit.match, fit.surface, problem, start) for start in starts]
+        unknowns = min(turned, key=lambda trial: trial.error).unknowns
     for _ in range(config.rounds):
         previous = unknowns
         points = _point_pairs(view, fit, problem, unknowns)
@@ -237,17 +250,17 @@ def _rated(
 def surface_error(view: EntityView, fit: Fit, surface: ModelSurface) -> float:
     """How far the surfaces of an entity and of an aligned model lie apart, in diagonals of the entity's box.
 
-    Distances are in position and normal, both ways: what the entity has and the model has not counts for 1, what the
-    model has and the entity has not for `SURPLUS`, as it may be unseen. Each saturates: far is far.
+    Root mean squares of distances in position and normal, both ways: what the entity has and the model has not counts
+    for 1, what the model has and the entity has not for `SURPLUS`, as it may be unseen. Other proportions raise it.
     """
     R, p, scale = fit.T_box_model[:3, :3], fit.T_box_model[:3, 3], fit.scale
     _, distances = surface.corresponding((view.surface.points - p) @ R / scale, view.surface.normals @ R)
     samples = surface.samples
-    there = samples.points[::SPARSE] * scale @ R.T + p
-    back = view.distances(there, samples.normals[::SPARSE] @ R.T)
-    return _saturated(scale * distances / view.diagonal) + SURPLUS * _saturated(back / view.diagonal)
+    back = view.distances(samples.points[::SPARSE] * scale @ R.T + p, samples.normals[::SPARSE] @ R.T)
+    sides = np.abs(R) @ fit.match.model.extents * scale / view.extents
+    error = (scale * _rms(distances) + SURPLUS * _rms(back)) / view.diagonal
+    return error * (1.0 + PROPORTIONS * float(np.linalg.norm(np.log(sides))))
 
 
-def _saturated(distances: Float64) -> float:
-    squares = distances**2
-    return float(np.sqrt(np.mean(squares / (1.0 + squares / SATURATION**2))))
+def _rms(distances: Float64) -> float:
+    return float(np.sqrt(np.mean(distances**2)))

@@ -18,7 +18,7 @@ from simtrack.objects.cad import CadModel
 if TYPE_CHECKING:
     from simtrack.raycast import TriangleMesh
 
-FACING = 0.1
+FACING = 0.05
 """What a difference of normals (of length 0 to 2) counts for, in diagonals of the box."""
 TOLERANCE = 0.2
 """Share by which a counterpart may be farther than the nearest."""
