@@ -1,6 +1,7 @@
 """A settled room as a static world: what a robot drives through, surveys and looks at."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from simtrack.geometry.transforms import inverse, transform
 from simtrack.simulation.building.parts import StaticPart, StaticWorld, Support
 from simtrack.simulation.building.rooms.fittings import Cleat
 from simtrack.simulation.building.rooms.physics import RoomEntity, settled_room
-from simtrack.simulation.building.rooms.plan import KINDS
+from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
 
 SMALL = 0.6
 """Metres: what is smaller along all sides is clutter and too small for a survey."""
@@ -21,7 +22,7 @@ SMALL = 0.6
 class RoomConfig:
     """Which room is built."""
 
-    kind: str = "any"
+    kind: RoomKind | Literal["any"] = "any"
     """One of `KINDS`, or ``any``: drawn from the seed."""
 
     def __post_init__(self) -> None:
@@ -37,7 +38,7 @@ def room_world(seed: int, config: RoomConfig | None = None) -> StaticWorld:
         config: its kind.
     """
     config = RoomConfig() if config is None else config
-    kind = dict(zip(KINDS, KINDS, strict=True)).get(config.kind)
+    kind = None if config.kind == "any" else config.kind
     room = settled_room(seed, kind)
     things = [entity for entity in room.entities if entity.placed is not None]
     cleats = [_cleat_part(cleat) for cleat in room.plan.cleats]
