@@ -51,7 +51,7 @@ def reconstruct(
     folder = out if out is not None else Path("runs") / default
     with (
         console.ProgressLine(f"reconstruct {source}", "collecting entities", to_stderr=True) as line,
-        _new_folder(folder, overwrite) as work,
+        new_folder(folder, overwrite) as work,
     ):
         given = source_entities(source, entities, seed)
         line.say("planes and contact graph")
@@ -101,7 +101,7 @@ def _name_file(path: Path) -> None:
 
 
 @contextmanager
-def _new_folder(folder: Path, overwrite: bool) -> Iterator[Path]:
+def new_folder(folder: Path, overwrite: bool) -> Iterator[Path]:
     """A folder to work in, beside the wanted one, which it becomes if all goes well; else nothing is left of it.
 
     Raises:

@@ -14,7 +14,7 @@ from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.boxes import OrientedBox
 from simtrack.geometry.transforms import transform
-from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.candidates import CadCandidate, PlacedSupport
 from simtrack.perception.reconstruction.interference import Contact, Interference
 from simtrack.perception.reconstruction.kinematic_tree import FIXED_CLASSES, scaled_mass
 from simtrack.perception.reconstruction.layout import layout_slabs
@@ -27,6 +27,10 @@ SLACK = 2e-4
 """Metres that pushed models keep between them."""
 LEAST_AREA = 0.2
 """Share of a bottom over a face from which it is taken for the one that is stood on."""
+OVERHANG = 0.15
+"""Share of its width by which the middle of what stands on a face stays away from the face's edge."""
+STILL = 1e-7
+"""Metres that are no motion."""
 LEVEL = 0.7
 """|z| of a contact's normal from which it is a matter of support."""
 
@@ -95,6 +99,7 @@ class _Snapping:
         self.shifts = {name: np.zeros(3) for name in self.start}
         self.afloat: set[str] = set()
         self.parts: dict[str, str] = {}
+        self.rested: dict[str, Float64] = {}
         self.ancestors = {name: self._above(name) for name in self.order}
         self.weight = {name: self._mobility(name) for name in self.start}
 
@@ -123,10 +128,12 @@ class _Snapping:
     # ---------------------------------------------------------------------------------------------------------- heights
 
     def _stack(self) -> None:
-        """From the root to the leaves: put everything down on what supports it."""
-        self.afloat.clear()
+        """From the root to the leaves: put everything down on what supports it, if it has moved against that."""
         for name in self.order:
             support = self.graph.supports[name]
+            if name in self.rested and np.abs(self._against(name) - self.rested[name]).max() < STILL:
+                continue
+            self.afloat.discard(name)
             if support.kind is SupportKind.HUNG:
                 self._hang(name, support.parent, support.plane)
             elif support.kind is SupportKind.ROOT:
@@ -134,6 +141,12 @@ class _Snapping:
                     self.shifts[name][2] += self.ground - self._solid(name).bottom
             else:
                 self._put_down(name, support.parent, support.height)
+            self.rested[name] = self._against(name)
+
+    def _against(self, name: str) -> Float64:
+        """(N, 3) shifts of an entity against those of its supporters; its own, if it has none."""
+        below = [self.shifts[p] for p in self.graph.supporters(name) if p in self.start]
+        return self.shifts[name] - np.array(below or [np.zeros(3)])
 
     def _put_down(self, name: str, parent: str, height: float) -> None:
         solid = self._solid(name)
@@ -144,7 +157,8 @@ class _Snapping:
             face = best_face(self._placed(parent), moved, at, self.config.reach, LEAST_AREA, self._solid(parent))
             if face is not None:
                 self.parts[name] = face.part
-                solid = self._lift(name, face.height - solid.bottom)
+                self._bring_onto(name, face, inside=self.graph.supports[name].kind is SupportKind.INSIDE)
+                solid = self._shift(name, np.array([0.0, 0.0, face.height - solid.bottom]))
         below = {p: self._solid(p) for p in self.graph.supporters(name) if p != SCENE and p in self.start}
         tall = float(solid.high[:, 2].max() - solid.bottom)
         up = min(self.config.sink, 0.5 * tall)
@@ -154,21 +168,32 @@ class _Snapping:
         if found is None:
             self.afloat.add(name)
         else:
-            self._lift(name, found)
+            self._shift(name, np.array([0.0, 0.0, found]))
+
+    def _bring_onto(self, name: str, face: PlacedSupport, *, inside: bool) -> None:
+        """Shift on the level: what stands on a face has its middle over it, what is inside its whole footprint."""
+        solid = self._solid(name)
+        R, origin = face.T_map_support[:2, :2], face.T_map_support[:2, 3]
+        local = (np.concatenate(solid.pieces)[:, :2] - origin) @ R
+        low, high = local.min(axis=0), local.max(axis=0)
+        free = np.maximum(0.5 * face.size - (0.5 if inside else OVERHANG) * (high - low), 0.0)
+        middle = 0.5 * (low + high)
+        step = np.clip(middle, -free, free) - middle
+        if np.abs(step).max() > STILL:
+            self._shift(name, np.append(R @ step, 0.0))
 
     def _hang(self, name: str, parent: str, index: int) -> None:
         """Move along the normal of the plane that it hangs on, so that they touch."""
         plane = self.graph.nodes[parent].planes[index]
         shift = self.shifts[parent]
         off = min(float(plane.distance(piece - shift).min()) for piece in self._solid(name).pieces)
-        self.shifts[name] -= off * plane.normal
-        self._carry(name, -off * plane.normal)
+        self._shift(name, -off * plane.normal)
 
-    def _lift(self, name: str, height: float) -> Solid:
-        """Raise an entity; what stands on it follows."""
-        step = np.array([0.0, 0.0, height])
-        self.shifts[name] += step
-        self._carry(name, step)
+    def _shift(self, name: str, step: Float64) -> Solid:
+        """Move an entity by (3,); what stands on it follows."""
+        for moved in (name, *self.graph.descendants(name)):
+            if moved in self.chosen:
+                self.shifts[moved] += step
         return self._solid(name)
 
     # ---------------------------------------------------------------------------------------------------- pushing apart
@@ -195,8 +220,7 @@ class _Snapping:
             share = 0.0
         for name, part in ((a, (share - 1.0) * step), (b, share * step)):
             if np.any(part):
-                self.shifts[name] += part
-                self._carry(name, part)
+                self._shift(name, part)
         return True
 
     def _deepest(self, contacts: list[Contact]) -> list[Contact]:
@@ -218,11 +242,6 @@ class _Snapping:
         T = np.array(self.chosen[name].T_map_model, dtype=float)
         T[:3, 3] += self.shifts[name]
         return replace(self.chosen[name], T_map_model=T)
-
-    def _carry(self, name: str, step: Float64) -> None:
-        for other in self.graph.descendants(name):
-            if other in self.chosen:
-                self.shifts[other] += step
 
     def _above(self, name: str) -> list[str]:
         names = []

@@ -121,6 +121,9 @@ def rise(upper: Float64, lower: Float64) -> float | None:
     The maximum of z_l - z_u over points (x, y, z_u) of the upper and (x, y, z_l) of the lower piece: a linear program
     over the weights of their corners ((K, 3) and (L, 3)).
     """
+    most = float(lower[:, 2].max() - upper[:, 2].min())
+    if _meet(lower[lower[:, 2] > lower[:, 2].max() - _CLOSE], upper[upper[:, 2] < upper[:, 2].min() + _CLOSE]):
+        return most  # the usual case: a level bottom over a level top
     from scipy.optimize import linprog
 
     corners = np.concatenate([upper, lower])
@@ -129,6 +132,17 @@ def rise(upper: Float64, lower: Float64) -> float | None:
     equal = np.stack([sign * corners[:, 0], sign * corners[:, 1], first, ~first]).astype(float)
     found = linprog(sign * corners[:, 2], A_eq=equal, b_eq=[0.0, 0.0, 1.0, 1.0], method="highs")
     return -float(found.fun) if found.status == 0 else None
+
+
+def _meet(first: Float64, second: Float64) -> bool:
+    """Whether the convex hulls of the x, y of points have a point in common."""
+    if (np.maximum(first.min(axis=0), second.min(axis=0)) > np.minimum(first.max(axis=0), second.max(axis=0)))[
+        :2
+    ].any():
+        return False
+    from shapely import MultiPoint
+
+    return bool(MultiPoint(first[:, :2]).convex_hull.intersects(MultiPoint(second[:, :2]).convex_hull))
 
 
 def resting_rise(upper: Solid, lower: Mapping[str, Solid], window: tuple[float, float]) -> float | None:

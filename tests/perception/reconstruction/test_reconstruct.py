@@ -1,0 +1,121 @@
+"""From a graph to a functional scene: every entity ends up in it, and bad input is said to be bad."""
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from corner import FLOOR, block, corner, cupboard_model, graph_of, table_mesh, table_model
+
+from simtrack.geometry.meshes import Mesh, is_closed
+from simtrack.objects.cad import CadModel
+from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.own_model import is_own, own_candidate
+from simtrack.perception.reconstruction.reconstruct import NoteCode, Reconstruction, reconstruct
+from simtrack.perception.reconstruction.record import dump_reconstruction
+from simtrack.perception.scene_graph.contact import ContactGraph, EntityMesh, EntityNode, FindingCode
+
+MODELS = {"table": table_model("table-test", (1.0, 0.6, 0.7)), "cabinet": cupboard_model()}
+
+
+def centred(node: EntityNode, graph: ContactGraph, models: Sequence[CadModel]) -> list[CadCandidate]:
+    """One model a class, put into the middle of the box."""
+    return [CadCandidate(MODELS[node.semantic_class], node.box.T_map_box, 1.0)] if node.semantic_class in MODELS else []
+
+
+def scene(**things: tuple[str, Mesh]) -> Reconstruction:
+    return reconstruct(corner(**things), shortlist=centred)
+
+
+@pytest.fixture(scope="module")
+def laid() -> Reconstruction:
+    return scene(
+        desk=("table", table_mesh((1.0, 0.6, 0.74), (0.0, 0.0, 0.0))),
+        gadget=("gadget", block((0.2, 0.2, 0.2), (0.1, 0.0, 0.74))),
+        cup=("cup", block((0.08, 0.08, 0.1), (0.1, 0.0, 0.94))),
+    )
+
+
+def test_every_entity_is_in_the_scene_at_the_height_of_what_it_stands_on(laid: Reconstruction) -> None:
+    assert {body.name for body in laid.tree.bodies} == {"scene", "floor", "wall", "desk", "gadget", "cup"}
+    heights = {n: float(c.candidate.mesh().vertices[:, 2].min()) for n, c in laid.choices.items()}
+    assert heights == pytest.approx({"desk": 0.0, "gadget": 0.7, "cup": 0.9}, abs=1e-3)
+    assert all(abs(choice.residual) < 1e-6 for choice in laid.choices.values())
+
+
+def test_what_has_no_model_is_its_own_mesh_and_that_is_said(laid: Reconstruction) -> None:
+    assert {name: choice.own_mesh for name, choice in laid.choices.items()} == {
+        "desk": False,
+        "gadget": True,
+        "cup": True,
+    }
+    assert {note.entity: note.code for note in laid.notes} == {
+        "gadget": NoteCode.NO_MODEL,
+        "cup": NoteCode.NO_CANDIDATE,
+    }
+    assert "gadget" in next(note.message for note in laid.notes if note.code is NoteCode.NO_MODEL)
+
+
+def test_the_record_tells_which_model_stands_where(laid: Reconstruction) -> None:
+    document = json.loads(dump_reconstruction(laid))
+    rows = {row["name"]: row for row in document["entities"]}
+    assert rows["desk"]["model"] == "table-test"
+    assert rows["cup"]["parent"] == "gadget"
+    np.testing.assert_allclose(rows["desk"]["T_map_model"], laid.choices["desk"].candidate.T_map_model)
+
+
+def test_without_a_floor_there_is_a_level_ground_and_that_is_said() -> None:
+    made = reconstruct(
+        graph_of([EntityMesh("desk", "table", table_mesh((1.0, 0.6, 0.7), (0.0, 0.0, 0.2)))]), shortlist=centred
+    )
+    assert FindingCode.NO_FLOOR in {finding.code for finding in made.graph.findings}
+    assert [note.code for note in made.notes] == [NoteCode.GROUND_INFERRED]
+    assert made.tree.by_name["ground"].collision[0].corners()[:, 2].max() == pytest.approx(0.2)
+
+
+def test_entities_without_planes_and_empty_meshes_are_findings_and_the_rest_is_made() -> None:
+    ball = Mesh(*_ball(0.15, (0.0, 0.0, 0.15)))
+    nothing = EntityMesh("ghost", "cup", Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32)))
+    made = reconstruct(graph_of([FLOOR, EntityMesh("ball", "ball", ball), nothing]), shortlist=centred)
+    codes = {finding.entity: finding.code for finding in made.graph.findings}
+    assert codes["ghost"] is FindingCode.INVALID_ENTITY
+    assert codes["ball"] is FindingCode.NO_PLANES
+    assert set(made.choices) == {"ball"}
+
+
+def test_where_no_model_has_a_place_for_what_is_inside_the_own_mesh_has() -> None:
+    """A bookcase whose only model is a solid block."""
+    boards = [block((0.02, 0.3, 0.9), (x, 0.0, 0.0)) for x in (-0.41, 0.41)]
+    boards += [block((0.8, 0.3, 0.02), (0.0, 0.0, z)) for z in (0.0, 0.44, 0.88)]
+    shelf = Mesh(
+        np.concatenate([board.vertices for board in boards]),
+        np.concatenate([board.faces + 8 * k for k, board in enumerate(boards)]),
+    )
+    graph = corner(case=("table", shelf), cup=("cup", block((0.08, 0.08, 0.1), (0.0, 0.0, 0.46))))
+    assert graph.parent("cup") == "case"
+    solid = table_model("table-solid", (0.84, 0.3, 0.9))
+    made = reconstruct(graph, shortlist=lambda node, graph, models: [CadCandidate(solid, node.box.T_map_box, 1.0)]
+                       if node.name == "case" else [])  # fmt: skip
+    cup = made.choices["cup"].candidate.mesh().bounds
+    assert NoteCode.INTERPENETRATING not in {note.code for note in made.notes}
+    assert cup[0, 2] == pytest.approx(0.46, abs=5e-3) or cup[0, 2] == pytest.approx(0.02, abs=5e-3)
+
+
+def test_an_own_mesh_reaches_down_to_its_support() -> None:
+    """Of a table only the top and the upper half of the legs was seen."""
+    table = table_mesh((1.0, 0.6, 0.7), (0.0, 0.0, 0.0))
+    seen = Mesh(np.maximum(table.vertices, [-np.inf, -np.inf, 0.4]), table.faces)
+    graph = corner(desk=("table", seen))
+    candidate, _ = own_candidate(graph.nodes["desk"])
+    assert is_own(candidate)
+    low, high = candidate.mesh().bounds[:, 2]
+    assert (low, high) == pytest.approx((0.0, 0.7), abs=2e-3)
+    assert all(is_closed(convex) for convex in candidate.model.parts[0].convex)
+    assert candidate.model.mass > 0.0
+
+
+def _ball(radius: float, centre: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    return mesh.vertices + centre, mesh.faces
