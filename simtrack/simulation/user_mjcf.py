@@ -50,7 +50,8 @@ def attach(
     user, model = read_model(path, scene.path.parent, without)
     for geom in user.geoms:
         geom.group = COLLISION if geom.group <= 2 else geom.group
-    user.option.timestep = spec.option.timestep
+    for name in ("timestep", "integrator", "cone", "impratio"):  # one physics for all; MuJoCo warns of others
+        setattr(user.option, name, getattr(spec.option, name))
     shapes = [geom_shape(model, geom, path) for geom in range(model.ngeom) if model.geom_group[geom] <= 2]
     spec.attach(user, prefix=PREFIX, frame=spec.worldbody.add_frame(pos=[0.0, 0.0, -lowered]))
     for number, (body, mesh, T) in enumerate(shapes):
