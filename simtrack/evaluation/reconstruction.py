@@ -88,6 +88,8 @@ class RoomOutcome:
     bodies: tuple[BodyOutcome, ...]
     """Empty if the physics was not checked."""
     verdict: str
+    problems: tuple[str, ...]
+    """What speaks against the scene, as the check words it."""
     margin: float
     """Metres that the deciding engine's shapes are thicker than drawn, a side; subtracted."""
     agreement: float | None
@@ -96,6 +98,8 @@ class RoomOutcome:
     """Wall clock: planes, boxes and contact graph."""
     seconds: float
     """Wall clock from entities to written files; the check is not in it."""
+    cpu_seconds: float
+    """The same as time of the processor, which other work on the machine does not lengthen."""
 
     @property
     def distance(self) -> int:
@@ -172,21 +176,24 @@ def evaluate_room(
 
     room = settled_room(seed, kind)
     meshes, seen = room_entities(room, entities, np.random.default_rng(np.random.SeedSequence([seed, 0])))
-    start = time.perf_counter()
+    start, processor = time.perf_counter(), time.process_time()
     nodes, findings = entity_nodes(meshes, np.random.default_rng(0))
     graph = build_contact_graph(nodes, findings=findings)
     graph_seconds = seconds = time.perf_counter() - start
+    cpu_seconds = time.process_time() - processor
     models: tuple[ModelOutcome, ...] = ()
     report: CheckReport | None = None
     if stages != "graph":
         made = reconstruct(graph, name=f"room {seed}")
         with tempfile.TemporaryDirectory(prefix="simtrack-evaluate-") as temporary:
             files = write_scene(made.tree, temporary if folder is None else folder)
-            seconds = time.perf_counter() - start
+            seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - processor
             models = model_outcomes(made, room, seen)
             if stages == "physics":
                 report = check_urdf(files.urdf)
-    return outcome(f"{kind or 'rooms'}:{seed}", room, entities, graph, models, report, (graph_seconds, seconds))
+    return outcome(
+        f"{kind or 'rooms'}:{seed}", room, entities, graph, models, report, (graph_seconds, seconds, cpu_seconds)
+    )
 
 
 def outcome(
@@ -196,9 +203,9 @@ def outcome(
     graph: ContactGraph,
     models: tuple[ModelOutcome, ...],
     report: CheckReport | None,
-    seconds: tuple[float, float],
+    seconds: tuple[float, float, float],
 ) -> RoomOutcome:
-    """The figures of one room; `seconds` are those of the graph and of everything up to the written files."""
+    """The figures of one room; `seconds` are those of the graph, of everything up to the written files, and as CPU."""
     estimate = SupportTree(
         {name: node.semantic_class for name, node in graph.nodes.items()},
         {name: tuple(graph.supporters(name)) for name in graph.nodes},
@@ -228,10 +235,14 @@ def outcome(
         models=models,
         bodies=bodies,
         verdict="not checked" if report is None else report.verdict,
+        problems=()
+        if report is None
+        else tuple(str(f) for f in report.findings if f.severity in ("problem", "unreadable")),
         margin=0.0 if deciding is None else deciding.margin,
         agreement=None if report is None else report.agreement,
         graph_seconds=seconds[0],
         seconds=seconds[1],
+        cpu_seconds=seconds[2],
     )
 
 
@@ -289,6 +300,7 @@ def summary(outcomes: Sequence[RoomOutcome]) -> Metrics:
         ),
         "seconds.graph": quantile([room.graph_seconds for room in outcomes], 0.5, "s", "no rooms"),
         "seconds.median": quantile([room.seconds for room in outcomes], 0.5, "s", "no rooms"),
+        "seconds.cpu.median": quantile([room.cpu_seconds for room in outcomes], 0.5, "s", "no rooms"),
         "seconds.worst": quantile([room.seconds for room in outcomes], 1.0, "s", "no rooms"),
     }
     return figures | _model_figures([model for room in outcomes for model in room.models]) | _physics_figures(outcomes)
@@ -346,7 +358,7 @@ def outcome_to_json(room: RoomOutcome) -> dict[str, Any]:
 def outcome_from_json(document: dict[str, Any]) -> RoomOutcome:
     """Inverse of `outcome_to_json`, through JSON; raises KeyError and TypeError for anything else."""
     fixed = dict(document)
-    for name in ("wrong_support", "missing", "extra", "leaning"):
+    for name in ("wrong_support", "missing", "extra", "leaning", "problems"):
         fixed[name] = tuple(fixed[name])
     fixed["models"] = tuple(ModelOutcome(**row) for row in fixed["models"])
     fixed["bodies"] = tuple(BodyOutcome(**row) for row in fixed["bodies"])
