@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import pytest
-from test_command import refused
 
+from simtrack.cli.main import main
 from simtrack.cli.reconstruct import FILES, new_folder
 from simtrack.errors import InvalidValueError, OutputExistsError
 
@@ -47,9 +47,15 @@ def test_existing_folders_and_files_are_refused(tmp_path: Path) -> None:
         pass
 
 
-def test_sources_that_are_none_are_named(tmp_path: Path) -> None:
-    assert "Known:" in refused("reconstruct", "nowhere", "--out", tmp_path / "x")
-    assert "true or partial" in refused("reconstruct", "rooms:7", "--entities", "tracked", "--out", tmp_path / "x")
+def test_sources_that_are_none_are_refused_and_leave_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "empty").mkdir()
-    assert "graph.json" in refused("reconstruct", tmp_path / "empty", "--out", tmp_path / "x")
-    assert not (tmp_path / "x").exists()
+    for source, more, said in (
+        ("nowhere", [], "Known:"),
+        ("rooms:7", ["--entities", "tracked"], "true or partial"),
+        (str(tmp_path / "empty"), [], "graph.json"),
+    ):
+        assert main(["reconstruct", source, "--out", str(tmp_path / "x"), *more]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
