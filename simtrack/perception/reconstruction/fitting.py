@@ -23,7 +23,7 @@ SIDES: Float64 = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 """(4, 2) directions of the upright sides of a box."""
 OPENINGS = (0.25, 0.5, 0.75)
 """Shares of the range of a joint that are tried."""
-OPENED = 0.97
+OPENED = 0.9
 """Share of the error that an opened joint must not exceed to be believed."""
 SURPLUS = 0.5
 """Weight of what the model has and the entity has not."""
@@ -33,6 +33,8 @@ YAW_STARTS = (0.0, -np.pi / 6, np.pi / 6)
 """Where the yaw of what is no box starts: its smallest box may be turned against it."""
 SPARSE = 3
 """Every how many-th point of a model is compared with the entity."""
+_ROUND = 24
+"""Yaw symmetries of a model that any turn maps onto itself."""
 _OUTWARD = 0.7
 """Cosine between a point's normal and a side that it counts for."""
 
@@ -148,20 +150,21 @@ def coarse_fit(view: EntityView, match: CadMatch, config: AlignmentConfig) -> Fi
 
 def refined(view: EntityView, fit: Fit, config: AlignmentConfig) -> Fit:
     """Align a model further with the points of the entity's surface, which find their counterparts anew in rounds."""
+    turns = YAW_STARTS if not view.boxy and len(fit.match.model.yaw_symmetries) < _ROUND else (0.0,)
+    return min((fit, *(_from(view, fit, turn, config) for turn in turns)), key=lambda found: found.error)
+
+
+def _from(view: EntityView, fit: Fit, turn: float, config: AlignmentConfig) -> Fit:
+    """The refined fit when its yaw starts `turn` radians off."""
     problem = _problem(view, fit.match, config)
-    unknowns = fit.unknowns
-    if not view.boxy:
-        starts = [unknowns + [0.0, turn, 0.0, 0.0] for turn in YAW_STARTS]
-        turned = [_rated(view, fit.match, fit.surface, problem, start) for start in starts]
-        unknowns = min(turned, key=lambda trial: trial.error).unknowns
+    unknowns = fit.unknowns + [0.0, turn, 0.0, 0.0]
     for _ in range(config.rounds):
         previous = unknowns
         points = _point_pairs(view, fit, problem, unknowns)
         unknowns = solve(replace(problem, points=points), unknowns)
         if np.abs(unknowns - previous).max() < 1e-4:
             break
-    found = _rated(view, fit.match, fit.surface, problem, unknowns)
-    return found if found.error < fit.error else fit
+    return _rated(view, fit.match, fit.surface, problem, unknowns)
 
 
 def with_open_joints(view: EntityView, fit: Fit, config: AlignmentConfig) -> Fit:

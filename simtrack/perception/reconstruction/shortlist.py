@@ -39,12 +39,12 @@ class ShortlistConfig:
     """Share of the best upright candidate's error below which a tipped one goes before it: things stand as they are
     made to."""
     blocked_front: float = 1.5
-    """Factor on the error of a candidate whose front faces a wall: nobody could use it."""
+    """Factor on the error of an articulated candidate whose front faces a wall: nobody could open it."""
     access: float = 0.3
     """Metres that a front needs to a wall."""
     unseen_front: float = 0.3
-    """Factor, added to 1, on the error of a candidate whose front nobody saw where its rear was seen: rears stand
-    against walls."""
+    """Factor, added to 1, on the error of an articulated candidate whose front nobody saw where its rear was seen:
+    rears stand against walls."""
     opened: int = 3
     """Candidates of articulated models for which open positions of the joints are tried."""
 
@@ -111,8 +111,8 @@ def ranking_error(fit: Fit, view: EntityView, free: Float64, config: ShortlistCo
     error = fit.error
     if fit.match.orientation not in UPRIGHT:
         return error / config.advantage
-    if len(fit.match.model.yaw_symmetries) > 1 and np.ptp(np.abs(fit.match.model.yaw_symmetries)) > 3.0:
-        return error  # front and rear are alike
+    if not fit.match.model.articulated:
+        return error
     side = int(np.argmax(SIDES @ -fit.T_box_model[:2, 1]))
     if free[side] < config.access <= free[(side + 2) % 4]:
         error *= config.blocked_front
