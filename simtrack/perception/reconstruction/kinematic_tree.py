@@ -55,6 +55,7 @@ def kinematic_tree(
     links: dict[tuple[str, str], str] = {}
     if ground is not None:
         bodies.append(_ground(_unique("ground", taken), root.name, ground))
+        poses[bodies[-1].name] = np.eye(4)
     of_entity |= {entity: _unique(_printable(entity), taken) for entity in graph.descendants()}
     for entity in graph.descendants():
         node, body_name = graph.nodes[entity], of_entity[entity]
@@ -69,7 +70,10 @@ def kinematic_tree(
             )  # fmt: skip
             continue
         candidate = chosen[entity]
-        kind: JointKind = "floating" if is_free(graph, entity, candidate) else "fixed"
+        grounded = ground is not None and graph.supports[entity].kind is SupportKind.ROOT
+        if grounded:
+            parent = bodies[1].name
+        kind: JointKind = "floating" if is_free(graph, entity, candidate, grounded=grounded) else "fixed"
         T_map_base = np.asarray(candidate.T_map_model, float)
         parent = links.get((graph.supports[entity].parent, (parts or {}).get(entity, "")), parent)
         joint = BodyJoint(f"{body_name}/{kind}", kind, parent, inverse(poses[parent]) @ T_map_base)
@@ -82,10 +86,13 @@ def kinematic_tree(
     return BodyTree(_printable(name), tuple(bodies))
 
 
-def is_free(graph: ContactGraph, entity: str, candidate: CadCandidate) -> bool:
-    """Whether a hand can lift the entity: not hung, not furniture, not heavy, and standing on something."""
+def is_free(graph: ContactGraph, entity: str, candidate: CadCandidate, *, grounded: bool = False) -> bool:
+    """Whether a hand can lift the entity: not hung, not furniture, not heavy, and standing on something.
+
+    Children of the scene stand on something if they are `grounded`, on a floor that nobody saw.
+    """
     support = graph.supports[entity]
-    if support.kind in (SupportKind.HUNG, SupportKind.ROOT):
+    if support.kind is SupportKind.HUNG or (support.kind is SupportKind.ROOT and not grounded):
         return False
     return graph.nodes[entity].semantic_class not in FIXED_CLASSES and scaled_mass(candidate) <= LIFTABLE
 

@@ -65,11 +65,14 @@ def test_the_record_tells_which_model_stands_where(laid: Reconstruction) -> None
 
 
 def test_without_a_floor_there_is_a_level_ground_and_that_is_said() -> None:
-    made = reconstruct(
-        graph_of([EntityMesh("desk", "table", table_mesh((1.0, 0.6, 0.7), (0.0, 0.0, 0.2)))]), shortlist=centred
-    )
+    desk = EntityMesh("desk", "table", table_mesh((1.0, 0.6, 0.7), (0.0, 0.0, 0.2)))
+    tin = EntityMesh("tin", "tin", block((0.1, 0.1, 0.1), (2.0, 0.0, 0.2)))
+    made = reconstruct(graph_of([desk, tin]), shortlist=centred)
     assert FindingCode.NO_FLOOR in {finding.code for finding in made.graph.findings}
-    assert [note.code for note in made.notes] == [NoteCode.GROUND_INFERRED]
+    assert NoteCode.GROUND_INFERRED in {note.code for note in made.notes}
+    joints = {body.name: (body.joint.kind, body.joint.parent) for body in made.tree.bodies if body.joint is not None}
+    assert joints["desk"] == ("fixed", "ground")
+    assert joints["tin"] == ("floating", "ground")
     assert made.tree.by_name["ground"].collision[0].corners()[:, 2].max() == pytest.approx(0.2)
 
 
