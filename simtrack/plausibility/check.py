@@ -198,6 +198,9 @@ def _engine_findings(result: EngineResult, config: CheckConfig) -> list[Finding]
         out += [Finding("problem", problem, body.name, texts[problem]) for problem in body.problems]
         if not body.problems and not body.resting:
             out.append(Finding("warning", "restless", body.name, f"still moves after {config.duration:g} s"))
+    for first, second, depth in result.inside:
+        message = f"is {1e3 * depth:.1f} mm deep in '{second}'; both are fixed to each other and cannot give way"
+        out.append(Finding("warning", "overlap", first, message))
     for joint in result.joints:
         free = f"{100.0 * joint.reached:.0f} % of its range"
         met = f"meets '{joint.blocked_by}', {1e3 * joint.depth:.0f} mm deep"

@@ -75,7 +75,8 @@ def examine(
     say("moving the joints")
     joints = sweep(engine, config)
     plausible = not any(result.problems for result in (*bodies, *joints))
-    return EngineResult(engine.name, engine.version, engine.margin, bodies, joints, plausible)
+    inside = overlaps_inside(engine, config)
+    return EngineResult(engine.name, engine.version, engine.margin, bodies, joints, plausible, inside)
 
 
 def settle(engine: Engine, config: CheckConfig) -> tuple[BodyResult, ...]:
@@ -107,6 +108,30 @@ def _overlaps(pairs: Sequence[Proximity], owner: dict[str, str]) -> dict[str, fl
             for name in (a, b):
                 deepest[name] = max(deepest.get(name, 0.0), -pair.distance)
     return deepest
+
+
+def overlaps_inside(engine: Engine, config: CheckConfig) -> tuple[tuple[str, str, float], ...]:
+    """Pairs of objects of one component that are in each other as described, and how deep, metres, deepest first.
+
+    They cannot push each other apart, so that settling shows nothing of it: cupboards that are fixed to the floor, say.
+    Left out are what a joint connects (doors overlap their frames at the hinge), and pairs without any mass: walls.
+    """
+    tree = engine.tree
+    owner = {body.name: part.name for part in tree.components for body in part.bodies}
+    groups = tree.rigid_groups()
+    mass: dict[str, float] = {}
+    for body in tree.bodies:
+        mass[groups[body.name]] = mass.get(groups[body.name], 0.0) + body.mass
+    joined = {frozenset((groups[body.name], groups[body.joint.parent])) for body in tree.bodies if body.joint}
+    deepest: dict[tuple[str, str], float] = {}
+    engine.reset()
+    for pair in engine.proximities(0.0):
+        a, b = sorted((groups[pair.body_a], groups[pair.body_b]))
+        if owner[a] != owner[b] or a == b or frozenset((a, b)) in joined or not mass[a] + mass[b] > 0.0:
+            continue
+        if -pair.distance > config.penetration:
+            deepest[a, b] = max(deepest.get((a, b), 0.0), -pair.distance)
+    return tuple((a, b, depth) for (a, b), depth in sorted(deepest.items(), key=lambda item: -item[1]))
 
 
 def _gap(engine: Engine, part: Component, owner: dict[str, str]) -> float | None:

@@ -115,6 +115,8 @@ class EngineResult:
     bodies: tuple[BodyResult, ...]
     joints: tuple[JointResult, ...]
     plausible: bool
+    inside: tuple[tuple[str, str, float], ...] = ()
+    """Objects of one component that are in each other, and how deep, metres: they cannot give way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,4 +146,5 @@ def result_from_json(document: dict[str, Any]) -> EngineResult:
     """Inverse of `dataclasses.asdict` of an `EngineResult`, through JSON."""
     bodies = tuple(BodyResult(**{**row, "problems": tuple(row["problems"])}) for row in document["bodies"])
     joints = tuple(JointResult(**{**row, "problems": tuple(row["problems"])}) for row in document["joints"])
-    return EngineResult(**{**document, "bodies": bodies, "joints": joints})
+    inside = tuple((a, b, float(depth)) for a, b, depth in document["inside"])
+    return EngineResult(**{**document, "bodies": bodies, "joints": joints, "inside": inside})

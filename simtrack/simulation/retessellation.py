@@ -18,13 +18,16 @@ def retessellated(mesh: Mesh, edge: float, rng: np.random.Generator) -> Mesh:
     """The planes of a mesh with new vertices about `edge` metres apart, at other places than the old ones.
 
     Meant for the sheets of walls, floors and ceilings: each plane is triangulated anew (Delaunay) between equidistant
-    points on its outline and jittered points inside. Outlines are kept; colours are dropped.
+    points on its outline and jittered points inside. Outlines are kept; colours are dropped. A wavy sheet, which has
+    hardly two faces on a plane, keeps its triangles.
     """
     normals = face_normals(mesh)
     offsets = np.einsum("fk,fk->f", normals, mesh.triangles[:, 0])
     keys = np.round(np.column_stack([normals, offsets]), _PLANE_DIGITS) + 0.0
     _, plane = np.unique(keys, axis=0, return_inverse=True)
     plane = plane.reshape(-1)
+    if plane.max() + 1 > 0.6 * len(mesh.faces):
+        return subdivide_to(Mesh(mesh.vertices, mesh.faces), int(2.0 * area(mesh) / edge**2))
     pieces = []
     for k in range(plane.max() + 1):
         rows = np.flatnonzero(plane == k)

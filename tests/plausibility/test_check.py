@@ -83,6 +83,22 @@ def test_overlapping_bodies_are_told(tmp_path: Path) -> None:
         assert cup.penetration_start == pytest.approx(0.03, abs=5e-4)
 
 
+def test_fixed_things_in_each_other_are_told_though_they_cannot_move(tmp_path: Path) -> None:
+    """The third stands in the second by less than is told; walls without mass may meet as they like."""
+    size = (0.4, 0.4, 0.4)
+    things = [block(name, size, 20.0, on("floor", name, at(x, 0, 0.2), "fixed"), convex=True)
+              for name, x in (("stove", 0.0), ("fridge", 0.35), ("sink", 0.746))]  # fmt: skip
+    walls = [block(name, (4.0, 0.1, 1.0), 0.0, on("floor", name, T, "fixed"))
+             for name, T in (("north", at(0, 2, 0.5)), ("south", at(0, 1.95, 0.5)))]  # fmt: skip
+    report = checked(BodyTree("kitchen", (floor(), *things, *walls)), tmp_path)
+    found = [(f.severity, f.subject) for f in report.findings if f.kind == "overlap"]
+    assert found == [("warning", "fridge")]
+    (pair,) = report.engines[0].inside
+    assert pair[:2] == ("fridge", "stove")
+    assert pair[2] == pytest.approx(0.05, abs=0.002)
+    assert report.verdict == "plausible"
+
+
 def test_what_stands_on_too_little_topples(tmp_path: Path) -> None:
     shelf = block("shelf", (0.4, 0.3, 0.7), 10.0, on("floor", "shelf", at(0.0, 0.0, 0.35)))
     lean = np.deg2rad(12.0)
