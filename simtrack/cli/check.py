@@ -29,16 +29,14 @@ def check(
         time_limit: Seconds that each engine may take.
     """
     from simtrack.cli import console
-    from simtrack.plausibility.check import check_urdf
+    from simtrack.plausibility.check import RESULTS, check_urdf
     from simtrack.plausibility.verdict import CheckConfig
 
     folder = out if out is not None else Path("runs") / f"check-{file.stem}"
     with console.ProgressLine(f"check of {file.name}", "settling in both engines"):
         report = check_urdf(file, root=root, out=folder, config=CheckConfig(duration=duration), time_limit=time_limit)
     show(report)
-    console.show_written(
-        folder, [name for name in ("check.json", "before.png", "after.png") if (folder / name).is_file()]
-    )
+    console.show_written(folder, [name for name in RESULTS if (folder / name).is_file()])
     return report.exit_code
 
 

@@ -26,6 +26,8 @@ from simtrack.plausibility.verdict import (
 
 ENGINES = ("pybullet", "mujoco")
 """The first decides; the others stand beside it."""
+RESULTS = ("check.json", "before.png", "after.png")
+"""Files that a check writes."""
 TIME_LIMIT = 300.0
 """Seconds that an engine may take."""
 LOG_TAIL = 300
@@ -78,6 +80,8 @@ def check_urdf(
     folder = None if out is None else Path(out)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
+        for name in RESULTS:  # of an older check: none of them may pass for this one's
+            (folder / name).unlink(missing_ok=True)
     with tempfile.TemporaryDirectory(prefix="simtrack-check-") as work:
         children = [
             _start(name, Path(work) / name, Path(path), root, folder if k == 0 else None, config)
@@ -88,7 +92,7 @@ def check_urdf(
     report = judge(Path(path), answers, config)
     if folder is not None:
         document = {"verdict": report.verdict, **asdict(report)}
-        (folder / "check.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+        (folder / RESULTS[0]).write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     return report
 
 

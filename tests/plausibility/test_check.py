@@ -221,5 +221,6 @@ def test_the_command_ends_with_the_verdict(tmp_path: Path) -> None:
     fallen = command_line(urdf, "--duration", 1, "--out", tmp_path / "out")
     assert fallen.returncode == 1, fallen.stderr
     assert "floats" in fallen.stdout and "not plausible" in fallen.stdout
-    missing = command_line(tmp_path / "nothing.urdf")
+    missing = command_line(tmp_path / "nothing.urdf", "--out", tmp_path / "out")
     assert missing.returncode == 2 and "no such file" in missing.stdout
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["check.json"]
