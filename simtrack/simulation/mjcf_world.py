@@ -15,7 +15,9 @@ import numpy as np
 from simtrack.contracts import Float64, Room
 from simtrack.errors import FileFormatError
 from simtrack.geometry.meshes import Mesh, concatenate, face_areas, face_normals, transformed
+from simtrack.geometry.planes import detect_planes
 from simtrack.geometry.transforms import inverse, rotation_from_quaternion, rpy_from_rotation, transform
+from simtrack.geometry.upright_boxes import upright_box
 from simtrack.objects import load_object
 from simtrack.objects.registry import catalogue
 from simtrack.simulation.building.parts import StaticPart, StaticWorld, polygon_area, room_at
@@ -31,6 +33,8 @@ LEVEL = 0.03
 """Metres within which faces are of one floor."""
 LEAST_FLOOR = 1.0
 """Square metres."""
+LEAST_SUPPORT = 0.01
+"""Square metres of a face that things stand on."""
 VIEW = 1.3
 """Metres between the robot and what it looks at first."""
 TRIES = 2000
@@ -44,7 +48,7 @@ def mjcf_scene(path: Path) -> SceneFile:
     """
     path = Path(path)
     reading = _Reading(path, path.resolve().parent)
-    world = reading.building()
+    world = reading.building(supports=False)
     objects = [
         {"model": model, "name": reading.name(body), "place": {"pose": reading.pose_of(body)}}
         for body, model in reading.known_objects()
@@ -151,8 +155,8 @@ class _Reading:
             raise FileFormatError(self.path, "worldbody", f"{reason}; a plane or a box at the bottom will do")
         return best[1], best[2]
 
-    def building(self) -> StaticWorld:
-        """All that is fixed, one part a body, and the room that the floor is of."""
+    def building(self, *, supports: bool = True) -> StaticWorld:
+        """All that is fixed, one part a body, and the room that the floor is of; `supports`: with faces to stand on."""
         lowered = transform(None, (0.0, 0.0, -self.floor[1]))
         parts = []
         for body, mesh in self.surfaces.items():
@@ -169,6 +173,7 @@ class _Reading:
                     mesh=transformed(mesh, T_part_file),
                     T_map_part=T_map_part,
                     extents=high - low,
+                    supports=tuple(_supports(mesh, T_part_file)) if supports else (),
                     room="room",
                     collision=tuple(self._boxes(body, T_part_file)),
                 )
@@ -200,6 +205,16 @@ class _Reading:
         outline = outline if polygon_area(outline) > 0.0 else outline[::-1]
         top = max(float(surface.vertices[:, 2].max()) for surface in self.surfaces.values()) - level
         return Room("room", outline, 0.0, max(top, 2.0))
+
+
+def _supports(mesh: Mesh, T_part_file: Float64) -> Iterator[tuple[Float64, Float64]]:
+    """Rectangles around the level planes of a mesh that look up: T_part_face (4, 4), size (2,)."""
+    for plane in detect_planes(mesh, np.random.default_rng(0)):
+        if plane.normal[2] > FLAT and plane.area > LEAST_SUPPORT:
+            box = upright_box(mesh.vertices[np.unique(mesh.faces[plane.faces])])
+            T_file_face = box.T_map_box.copy()
+            T_file_face[2, 3] = plane.height_at(*T_file_face[:2, 3].tolist())
+            yield T_part_file @ T_file_face, box.extents[:2]
 
 
 def _start(path: Path, world: StaticWorld, objects: Float64) -> tuple[float, float, float]:

@@ -27,7 +27,11 @@ def written(folder: Path, *bodies: str) -> Path:
 def test_a_file_becomes_a_world_on_the_level_of_its_floor(tmp_path: Path) -> None:
     world = build_world(load_scene(written(tmp_path, FLOOR, DESK, CRATE, RELAY)), 0)
     assert {part.name: part.semantic_class for part in world.static.parts} == {"world": "floor", "desk": "desk"}
-    assert world.static.part("desk").T_map_part[2, 3] == pytest.approx(0.7)
+    desk = world.static.part("desk")
+    assert desk.T_map_part[2, 3] == pytest.approx(0.7)
+    ((T_part_face, size),) = desk.supports
+    assert (desk.T_map_part @ T_part_face)[:3, 3] == pytest.approx([1.0, 0.0, 0.72], abs=1e-3)
+    assert sorted(size) == pytest.approx([0.8, 1.2], abs=1e-3)
     assert set(world.names) == {"world", "desk", "crate", "relay-7", "robot"}
     assert world.objects["relay-7"].name == "relay"
     relay = body_pose(world.data, world.bodies["relay-7"])
