@@ -22,7 +22,7 @@ from simtrack.objects.cache import UNUSABLE, digest, mesh_arrays, read_mesh, wri
 
 FACES = 2000
 """Faces that are left before coacd starts: it needs 25 s for 10,000."""
-TIME_LIMIT = 60.0
+TIME_LIMIT = 240.0
 """Seconds that the child may take."""
 MAX_PARTS = 24
 

@@ -109,7 +109,7 @@ class _Snapping:
         if self.order:
             scene = Interference(self.start)
             for _ in range(self.config.rounds):
-                stuck = self._beside(scene.contacts(self.shifts))
+                stuck = self._deepest(self._beside(scene.contacts(self.shifts)))
                 if not any(self._push(contact) for contact in stuck):
                     break
                 self._stack()
@@ -157,7 +157,8 @@ class _Snapping:
             face = best_face(self._placed(parent), moved, at, self.config.reach, LEAST_AREA, self._solid(parent))
             if face is not None:
                 self.parts[name] = face.part
-                self._bring_onto(name, face, inside=self.graph.supports[name].kind is SupportKind.INSIDE)
+                if name not in self.rested:  # once: pushing apart must not be undone
+                    self._bring_onto(name, face, inside=self.graph.supports[name].kind is SupportKind.INSIDE)
                 solid = self._shift(name, np.array([0.0, 0.0, face.height - solid.bottom]))
         below = {p: self._solid(p) for p in self.graph.supporters(name) if p != SCENE and p in self.start}
         tall = float(solid.high[:, 2].max() - solid.bottom)
