@@ -236,7 +236,8 @@ def pair_evidence(child: Posed, parent: Posed, config: ContactConfig) -> PairEvi
     if seated or overlap < config.contact_area:
         return PairEvidence(options=options, hang=hang, enclosure=around) if options or hang or around else NOTHING
     hidden = SupportOption(-1, c.bottom, 0.0, min(overlap, 1.0), _Look(child).rectangle(*parent.outline)[2])
-    in_range = p.bottom - config.contact_gap <= c.bottom < p.top
+    # a container may not have been seen down to its bottom; what lies on the child is none
+    in_range = p.bottom - min(config.contact_gap, 0.5 * float(c.box.extents[2])) <= c.bottom < p.top
     return PairEvidence(
         options=options,
         inside=hidden if in_range and around >= config.inside and _underneath(child, parent, config) else None,

@@ -1,6 +1,18 @@
 import numpy as np
+import pytest
+import small_rooms
 
-from simtrack.perception.scene_graph.contact import SCENE, ContactConfig, EntityNode, FindingCode
+from simtrack.geometry.meshes import Mesh, box_mesh, face_normals, subdivide_to, transformed
+from simtrack.geometry.transforms import rotation_from_rpy, transform
+from simtrack.perception.scene_graph.contact import (
+    SCENE,
+    ContactConfig,
+    EntityMesh,
+    EntityNode,
+    FindingCode,
+    build_contact_graph,
+    entity_nodes,
+)
 from simtrack.perception.scene_graph.contact.evidence import PairEvidence, Posed, SupportOption
 from simtrack.perception.scene_graph.contact.selection import select_supports
 
@@ -19,3 +31,32 @@ def test_a_cycle_is_broken_at_its_weakest_support_and_said(nodes: list[EntityNod
         (FindingCode.UNSUPPORTED, "bowl"),
     ]
     assert "tome -> cup -> bowl -> tome" in findings[0].message
+
+
+def test_a_book_across_two_thin_ones_lies_on_them_and_not_on_the_table() -> None:
+    floor = EntityMesh("floor", "floor", small_rooms.plate(6.0, 6.0))
+    table = EntityMesh("table", "table", small_rooms.table_mesh())
+    thin = box_mesh((0.13, 0.2, 0.028))
+    bases = [
+        EntityMesh(n, "book", thin, transform(None, np.array([x, 0.0, 0.764]))) for n, x in (("a", -0.1), ("b", 0.1))
+    ]
+    across = EntityMesh("across", "book", box_mesh((0.24, 0.16, 0.03)), transform(None, np.array([0.0, 0.0, 0.793])))
+    nodes, _ = entity_nodes([floor, table, *bases, across], np.random.default_rng(0))
+    assert set(build_contact_graph(nodes).supporters("across")) == {"a", "b"}
+    beside, _ = entity_nodes([floor, table, bases[0], across], np.random.default_rng(0))
+    assert build_contact_graph(beside).parent("across") == "table", "one of them alone does not carry it"
+
+
+@pytest.mark.parametrize(("below", "parent"), [(True, "wall"), (False, "floor")])
+def test_a_deep_thing_hangs_where_the_wall_below_it_was_seen(below: bool, parent: str) -> None:
+    upright = transform(rotation_from_rpy(np.pi / 2, 0.0, 0.0), np.array([0.0, 3.0, 1.25]))
+    sheet = subdivide_to(transformed(small_rooms.plate(4.0, 2.5), upright), 4000)
+    x, _, z = sheet.triangles.mean(axis=1).T
+    wall = Mesh(sheet.vertices, sheet.faces[below | (np.abs(x) > 0.4) | (z > 1.3)])
+    case = transformed(box_mesh((0.6, 0.3, 0.4)), transform(None, np.array([0.0, 2.849, 1.5])))
+    front = case.faces[face_normals(case)[:, 2] > -0.5]  # nobody saw its underside
+    entities = [EntityMesh("floor", "floor", small_rooms.plate(6.0, 6.0)), EntityMesh("wall", "wall", wall)]
+    nodes, _ = entity_nodes(
+        [*entities, EntityMesh("case", "cabinet", Mesh(case.vertices, front))], np.random.default_rng(0)
+    )
+    assert build_contact_graph(nodes).parent("case") == parent
