@@ -10,7 +10,16 @@ import numpy as np
 
 from simtrack.contracts import Float64
 from simtrack.errors import MeshError
-from simtrack.geometry.meshes import Mesh, convex_hull, face_areas, face_normals, sample_surface
+from simtrack.geometry.meshes import (
+    Mesh,
+    area,
+    convex_hull,
+    face_areas,
+    face_normals,
+    is_closed,
+    sample_surface,
+    volume,
+)
 from simtrack.geometry.planes import SurfacePlane
 
 LEVEL = np.cos(np.radians(3.0))
@@ -28,6 +37,10 @@ SAMPLES = 400
 THICKNESS = 0.002
 """Metres that a flat piece is given."""
 MAX_PIECES = 200
+MAX_SHELL = 150
+"""Faces up to which a hollow piece is plates behind its faces."""
+WALL = 0.02
+"""Metres of mean thickness from which a closed piece is solid."""
 
 
 def levelled(mesh: Mesh, planes: Sequence[SurfacePlane], T_mesh_map: Float64) -> Mesh:
@@ -49,7 +62,10 @@ def levelled(mesh: Mesh, planes: Sequence[SurfacePlane], T_mesh_map: Float64) ->
 
 
 def convex_pieces(mesh: Mesh) -> tuple[list[Mesh], Mesh | None]:
-    """Hulls of the connected pieces that are convex, and the rest of the mesh (None if nothing is left)."""
+    """Hulls of the connected pieces that are convex, plates behind the faces of hollow ones, and the rest of the mesh.
+
+    The rest is None if nothing is left.
+    """
     hulls: list[Mesh] = []
     left = np.arange(len(mesh.faces))
     for joined in (True, False):
@@ -64,7 +80,20 @@ def convex_pieces(mesh: Mesh) -> tuple[list[Mesh], Mesh | None]:
         if not rest:
             return hulls, None
         left = left[np.sort(np.concatenate(rest))]
-    return hulls, _part(mesh, left)
+    rest = []
+    for faces in connected_pieces(part := _part(mesh, left)):
+        piece = _part(part, faces)
+        if len(faces) <= MAX_SHELL and not _solid(piece):
+            plates = [_thickened(_part(piece, np.array([face]))) for face in range(len(faces))]
+            hulls += [plate for plate in plates if plate is not None]
+        else:
+            rest.append(faces)
+    return hulls, _part(part, np.sort(np.concatenate(rest))) if rest else None
+
+
+def _solid(piece: Mesh) -> bool:
+    """Whether a piece is closed and too thick to be made of sheets."""
+    return is_closed(piece) and 2.0 * volume(piece) > WALL * area(piece)
 
 
 def _part(mesh: Mesh, faces: np.ndarray) -> Mesh:

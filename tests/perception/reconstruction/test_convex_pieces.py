@@ -5,6 +5,7 @@ import pytest
 
 from simtrack.geometry.meshes import (
     Mesh,
+    area,
     box_mesh,
     concatenate,
     convex_hull,
@@ -61,18 +62,24 @@ def test_noise_and_missing_undersides_change_nothing_of_that() -> None:
     assert [volume(hull) for hull in hulls] == pytest.approx([1.2 * 0.6 * 0.04, 0.7 * 0.06**2], rel=0.4)
 
 
-def test_what_is_open_at_the_top_or_concave_is_left() -> None:
-    tub = without(box_mesh((0.4, 0.3, 0.2)), 2, 1.0)
+def test_a_solid_that_is_concave_is_left() -> None:
     elbow = _joined(concatenate([box_mesh((0.4, 0.1, 0.1)), at(box_mesh((0.1, 0.4, 0.1)), 0.15, 0.25, 0)]))
-    for left in (tub, elbow):
-        hulls, rest = convex_pieces(left)
-        assert hulls == []
-        assert rest is not None
-        assert len(rest.faces) == len(left.faces)
-    hulls, rest = convex_pieces(concatenate([at(tub, 2, 0, 0), BOARD]))
+    hulls, rest = convex_pieces(concatenate([elbow, at(BOARD, 2, 0, 0)]))
     assert len(hulls) == 1
     assert rest is not None
-    assert len(rest.faces) == len(tub.faces)
+    assert len(rest.faces) == len(elbow.faces)
+
+
+def test_a_tub_is_plates_behind_its_faces_and_stays_hollow() -> None:
+    tub = without(box_mesh((0.4, 0.3, 0.2)), 2, 1.0)
+    hulls, rest = convex_pieces(tub)
+    assert rest is None
+    assert sum(volume(hull) for hull in hulls) == pytest.approx(THICKNESS * area(tub), rel=0.01)
+    inside = np.array([[0.0, 0.0, 0.08], [0.19, 0.14, 0.09], [-0.19, 0.0, -0.09]])
+    for hull in hulls:
+        normals = face_normals(hull)
+        outside = (inside @ normals.T - np.einsum("fd,fd->f", normals, hull.triangles[:, 0])).max(axis=1)
+        assert (outside > 0.0).all()
 
 
 def test_boards_that_share_corners_are_told_apart_by_their_vertices() -> None:
