@@ -18,6 +18,8 @@ from simtrack.perception.scene_graph.contact.nodes import EntityKind, EntityNode
 
 _GRAVITY = np.array([0.0, 0.0, -1.0])
 _BINS = 64
+BOARD = 0.05
+"""Metres: thickness of a board that things stand on, noise included."""
 _ANYWHERE = -np.inf, np.inf
 
 
@@ -181,7 +183,8 @@ class PairEvidence:
     top: SupportOption | None = None
     """The child stands on the very top of a parent without a plane there: hidden support (an occluded table top)."""
     within: SupportOption | None = None
-    """The parent stands around the child in part, at its height, and no plane was seen there (a crammed shelf)."""
+    """No plane was seen there, but the parent stands around the child in part, at its height (a crammed shelf), or was
+    seen from below right under it (a high shelf)."""
     hang: HangOption | None = None
     enclosure: float = 0.0
     """Share of the horizontal directions in which the parent stands around the child, above the child's bottom."""
@@ -242,10 +245,20 @@ def pair_evidence(child: Posed, parent: Posed, config: ContactConfig) -> PairEvi
         options=options,
         inside=hidden if in_range and around >= config.inside and _underneath(child, parent, config) else None,
         top=hidden if abs(c.bottom - p.top) <= config.contact_gap and p.top < 0.5 * (c.bottom + c.top) else None,
-        within=hidden if in_range and around >= config.within and overlap >= 0.8 else None,
+        within=hidden if in_range and (_amid(around, overlap, config) or _on_seen_board(child, parent)) else None,
         hang=hang,
         enclosure=around,
     )
+
+
+def _amid(around: float, overlap: float, config: ContactConfig) -> bool:
+    """Whether the parent stands around the child in part, and all of the child is above it."""
+    return around >= config.within and overlap >= 0.8
+
+
+def _on_seen_board(child: Posed, parent: Posed) -> bool:
+    """Whether the child is right above the parent's underside, as on a board that was seen from below."""
+    return child.node.bottom - parent.node.bottom <= BOARD and parent.underside >= 0.3
 
 
 def _options(child: Posed, parent: Posed, config: ContactConfig) -> tuple[SupportOption, ...]:

@@ -60,3 +60,15 @@ def test_a_deep_thing_hangs_where_the_wall_below_it_was_seen(below: bool, parent
         [*entities, EntityMesh("case", "cabinet", Mesh(case.vertices, front))], np.random.default_rng(0)
     )
     assert build_contact_graph(nodes).parent("case") == parent
+
+
+def test_what_stands_on_a_high_board_that_was_seen_from_below_stands_on_it() -> None:
+    wall = transformed(small_rooms.plate(4.0, 2.5), transform(rotation_from_rpy(np.pi / 2, 0.0, 0.0), (0.0, 3.0, 1.25)))
+    board = transformed(box_mesh((0.8, 0.2, 0.02)), transform(None, (0.0, 2.89, 1.6)))
+    below = Mesh(board.vertices, board.faces[face_normals(board)[:, 2] < 0.5])  # nobody saw its top
+    cup = transformed(box_mesh((0.07, 0.07, 0.1)), transform(None, (0.1, 2.86, 1.66)))
+    shapes = [("floor", "floor", small_rooms.plate(6.0, 6.0)), ("wall", "wall", wall), ("shelf", "shelf", below)]
+    entities = [EntityMesh(*each) for each in (*shapes, ("cup", "cup", cup))]
+    graph = build_contact_graph(entity_nodes(entities, np.random.default_rng(0))[0])
+    assert (graph.parent("cup"), graph.parent("shelf")) == ("shelf", "wall")
+    assert graph.nodes["shelf"].planes[graph.supports["cup"].plane].hidden
