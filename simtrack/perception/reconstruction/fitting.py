@@ -31,6 +31,8 @@ PROPORTIONS = 0.3
 """What a side of the box that is larger or smaller by a factor of e adds to the error, relative to it."""
 YAW_STARTS = (0.0, -np.pi / 6, np.pi / 6)
 """Where the yaw of what is no box starts: its smallest box may be turned against it."""
+DENSE = 5
+"""Points of an entity's surface that a model's are compared with, for every point that is aligned."""
 SPARSE = 3
 """Every how many-th point of a model is compared with the entity."""
 _ROUND = 24
@@ -45,6 +47,9 @@ class EntityView:
 
     node: EntityNode
     surface: SurfacePoints
+    """Points that are aligned."""
+    dense: SurfacePoints
+    """More points, among which a model's find their nearest."""
     tied: bool
     """Whether it stands on the lower side of its box."""
 
@@ -52,13 +57,14 @@ class EntityView:
     def of(node: EntityNode, graph: ContactGraph, samples: int) -> "EntityView":
         """The view of a node that has a mesh."""
         assert node.shape is not None
-        points = SurfacePoints.of(node.shape.mesh, samples)
+        points = SurfacePoints.of(node.shape.mesh, DENSE * samples)
         T = node.T_map_entity
         R_box, origin = node.box.T_map_box[:3, :3], node.box.T_map_box[:3, 3]
-        local = SurfacePoints(
-            (points.points @ T[:3, :3].T + T[:3, 3] - origin) @ R_box, points.normals @ T[:3, :3].T @ R_box
-        )
-        return EntityView(node, local, graph.supports[node.name].kind is not SupportKind.HUNG)
+        places = (points.points @ T[:3, :3].T + T[:3, 3] - origin) @ R_box
+        normals = points.normals @ T[:3, :3].T @ R_box
+        few = SurfacePoints(places[:samples], normals[:samples])
+        tied = graph.supports[node.name].kind is not SupportKind.HUNG
+        return EntityView(node, few, SurfacePoints(places, normals), tied)
 
     @property
     def extents(self) -> Float64:
@@ -94,7 +100,7 @@ class EntityView:
     def _tree(self) -> Any:
         from scipy.spatial import KDTree
 
-        return KDTree(np.concatenate([self.surface.points, FACING * self.diagonal * self.surface.normals], axis=1))
+        return KDTree(np.concatenate([self.dense.points, FACING * self.diagonal * self.dense.normals], axis=1))
 
     def distances(self, points: Float64, normals: Float64) -> Float64:
         """(N,) distances in position and normal from (N, 3) points in the frame of the box to the surface, metres."""
@@ -155,13 +161,19 @@ def refined(view: EntityView, fit: Fit, config: AlignmentConfig) -> Fit:
 
 
 def _from(view: EntityView, fit: Fit, turn: float, config: AlignmentConfig) -> Fit:
-    """The refined fit when its yaw starts `turn` radians off."""
+    """The refined fit when its yaw starts `turn` radians off.
+
+    The footprint of what is no box says nothing of its yaw: a cup's box is turned as its handle and its rim happen to
+    fill it best.
+    """
+    if not view.boxy:
+        config = replace(config, footprint_weight=0.0)
     problem = _problem(view, fit.match, config)
     unknowns = fit.unknowns + [0.0, turn, 0.0, 0.0]
     for _ in range(config.rounds):
         previous = unknowns
         points = _point_pairs(view, fit, problem, unknowns)
-        unknowns = solve(replace(problem, points=points), unknowns)
+        unknowns = solve(replace(problem, points=points, start=unknowns), unknowns)
         if np.abs(unknowns - previous).max() < 1e-4:
             break
     return _rated(view, fit.match, fit.surface, problem, unknowns)

@@ -8,12 +8,15 @@ at whether the front could be used.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError
+from simtrack.geometry.boxes import OrientedBox
+from simtrack.geometry.meshes import face_areas, face_normals
+from simtrack.geometry.upright_boxes import MIN_SIDE
 from simtrack.objects.cad import CadModel
 from simtrack.perception.reconstruction.alignment import AlignmentConfig
 from simtrack.perception.reconstruction.candidates import CadCandidate
@@ -23,6 +26,8 @@ from simtrack.perception.scene_graph.contact import ContactGraph, EntityKind, En
 
 _WALL_AREA = 0.5
 """Square metres of the planes that count as walls."""
+_SEEN_BOTTOM = 0.02
+"""Share of the surface that faces down at the lower end of an entity whose bottom was seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +84,7 @@ def shortlist(
     config = config or ShortlistConfig()
     if not models or top < 1 or node.kind is EntityKind.LAYOUT or node.shape is None:
         return ()
+    node = on_its_bottom(node)
     view = EntityView.of(node, graph, config.alignment.samples)
     free = front_clearances(view, graph)
     fits = [
@@ -92,6 +98,25 @@ def shortlist(
         opened = [with_open_joints(view, fit, config.alignment) for fit in ranked[: config.opened]]
         ranked = _ranked([*opened, *ranked[config.opened :]], view, free, config)
     return tuple(_candidate(view, fit) for fit in ranked)
+
+
+def on_its_bottom(node: EntityNode) -> EntityNode:
+    """The node with its box down to its own lower end, if that was seen, and not to the support plane.
+
+    A support plane may be a centimetre off, which is much of a bowl's height. Snapping closes the gap.
+    """
+    assert node.shape is not None
+    mesh, T = node.shape.mesh, node.T_map_entity
+    heights = mesh.vertices @ T[2, :3] + T[2, 3]
+    low = float(heights[np.unique(mesh.faces)].min())
+    areas = face_areas(mesh)
+    at_bottom = heights[mesh.faces].max(axis=1) < low + max(0.1 * (node.top - low), 0.003)
+    seen = float(areas[at_bottom & (face_normals(mesh) @ T[2, :3] < -0.7)].sum())
+    if seen < _SEEN_BOTTOM * float(areas.sum()) or node.top - low < MIN_SIDE:
+        return node
+    T_box, extents = node.box.T_map_box.copy(), node.box.extents.copy()
+    T_box[2, 3], extents[2] = 0.5 * (node.top + low), node.top - low
+    return replace(node, box=OrientedBox(T_box, extents))
 
 
 def _ranked(fits: Sequence[Fit], view: EntityView, free: Float64, config: ShortlistConfig) -> list[Fit]:

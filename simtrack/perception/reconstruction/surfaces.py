@@ -73,7 +73,7 @@ class ModelSurface:
         return index.astype(np.int32), distances
 
     def at(self, positions: Mapping[str, float]) -> "ModelSurface":
-        """The same samples moved with their parts to other joint positions."""
+        """The model at other joint positions, as many points."""
         return _posed(self.model, len(self.samples.points), tuple(sorted(positions.items())))
 
 
