@@ -118,16 +118,17 @@ def overlaps_inside(engine: Engine, config: CheckConfig) -> tuple[tuple[str, str
     """
     tree = engine.tree
     owner = {body.name: part.name for part in tree.components for body in part.bodies}
-    groups = tree.rigid_groups()
-    mass: dict[str, float] = {}
-    for body in tree.bodies:
-        mass[groups[body.name]] = mass.get(groups[body.name], 0.0) + body.mass
+    groups: dict[str, str] = {}
+    for body in tree.bodies:  # fixed joints tie an object together, but to what has no mass they only hold it
+        tied = body.joint is not None and body.joint.kind == "fixed" and tree.by_name[body.joint.parent].mass > 0.0
+        groups[body.name] = groups[body.joint.parent] if body.joint is not None and tied else body.name
     joined = {frozenset((groups[body.name], groups[body.joint.parent])) for body in tree.bodies if body.joint}
     deepest: dict[tuple[str, str], float] = {}
     engine.reset()
     for pair in engine.proximities(0.0):
         a, b = sorted((groups[pair.body_a], groups[pair.body_b]))
-        if owner[a] != owner[b] or a == b or frozenset((a, b)) in joined or not mass[a] + mass[b] > 0.0:
+        scenery = tree.by_name[pair.body_a].mass == tree.by_name[pair.body_b].mass == 0.0
+        if owner[a] != owner[b] or a == b or frozenset((a, b)) in joined or scenery:
             continue
         if -pair.distance > config.penetration:
             deepest[a, b] = max(deepest.get((a, b), 0.0), -pair.distance)

@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -90,7 +90,13 @@ def test_fixed_things_in_each_other_are_told_though_they_cannot_move(tmp_path: P
               for name, x in (("stove", 0.0), ("fridge", 0.35), ("sink", 0.746))]  # fmt: skip
     walls = [block(name, (4.0, 0.1, 1.0), 0.0, on("floor", name, T, "fixed"))
              for name, T in (("north", at(0, 2, 0.5)), ("south", at(0, 1.95, 0.5)))]  # fmt: skip
-    report = checked(BodyTree("kitchen", (floor(), *things, *walls)), tmp_path)
+    root = Body("scene")
+    ground = block("floor", (4.0, 4.0, 0.1), 0.0, on("scene", "floor", at(0, 0, -0.05), "fixed"))
+    things = [replace(thing, joint=on("floor", thing.name, at(0, 0, 0.05) @ thing.joint.T_parent_body, "fixed"))
+              for thing in things if thing.joint is not None]  # fmt: skip
+    walls = [replace(wall, joint=on("scene", wall.name, wall.joint.T_parent_body, "fixed"))
+             for wall in walls if wall.joint is not None]  # fmt: skip
+    report = checked(BodyTree("kitchen", (root, ground, *things, *walls)), tmp_path)
     found = [(f.severity, f.subject) for f in report.findings if f.kind == "overlap"]
     assert found == [("warning", "fridge")]
     (pair,) = report.engines[0].inside
