@@ -22,12 +22,12 @@ def compile_kernels_once() -> None:
     file = (Path(tempfile.gettempdir()) / f"simtrack-kernels-{os.getuid()}.lock").open("w")
     compile_now = Dispatcher.compile
 
-    def compile_alone(self: Any, signature: Any) -> Any:
+    def compile_alone(self: Any, sig: Any) -> Any:
         # One lock a kernel: a kernel asks for those that it calls while it holds its own, so that none can wait for
         # another in a circle. Threads of this process stand in numba's own line first, for the same reason.
         kernel = zlib.crc32(f"{self.py_func.__code__.co_filename} {self.py_func.__qualname__}".encode())
         with global_compiler_lock, _locked(file.fileno(), kernel):
-            return compile_now(self, signature)
+            return compile_now(self, sig)
 
     Dispatcher.compile = compile_alone
 
