@@ -76,7 +76,8 @@ class LocalPool:
     def _spawn(self) -> _Worker:
         ours, theirs = self._context.Pipe()
         arguments = (theirs, self._task, os.getpid())
-        process = self._context.Process(target=_work, args=arguments)
+        # A daemon is ended when a script ends that raised and did not close the pool; another would be waited for.
+        process = self._context.Process(target=_work, args=arguments, daemon=True)
         with _environment(thread_limits(self._threads)):  # libraries read it when they are loaded
             process.start()
         theirs.close()
