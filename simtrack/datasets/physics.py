@@ -181,6 +181,7 @@ class _Drop:
         self._bodies, self._area = bodies, area
         spec = mujoco.MjSpec()
         spec.compiler.degree = False
+        spec.compiler.usethread = False  # see `simtrack.datasets.local.thread_limits`
         spec.option.timestep = TIMESTEP
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
