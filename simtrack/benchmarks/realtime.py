@@ -13,9 +13,11 @@ import statistics
 import threading
 import time
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeAlias
 
 import numpy as np
 
@@ -24,6 +26,8 @@ from simtrack.contracts import NANOSECONDS, RgbdFrame, SensorFrame
 from simtrack.perception.pipeline import PerceptionStack
 from simtrack.recordings import Recording
 
+Feed: TypeAlias = "queue.Queue[SensorFrame | Exception | None]"
+"""Frames in their order, then what has ended them: an error, or None."""
 READ_AHEAD = 90
 """Sensor frames that are unpacked ahead."""
 WARM_UP = 2.0
@@ -58,7 +62,7 @@ def run(options: Options) -> Benchmark:
     from simtrack.recordings import open_recording
 
     result = Benchmark("realtime")
-    duration, plays = (6.0, 1) if options.quick else (60.0, 3)
+    duration, plays = (4.0, 1) if options.quick else (60.0, 3)
     with TemporaryDirectory(prefix="simtrack-") as folder:
         log = Path(folder) / "feed.mcap"
         _record(log, duration, options)
@@ -95,7 +99,7 @@ def play(recording: Recording) -> Play:
         recording.static_map, recording.models, recording.robot, RecordedDetector(recording),
         T_map_base=start_pose(recording.metadata, recording.path),
     )  # fmt: skip
-    feed: queue.Queue[SensorFrame | None] = queue.Queue(READ_AHEAD)
+    feed: Feed = queue.Queue(READ_AHEAD)
     stopped = threading.Event()
     reader = threading.Thread(target=_read, args=(recording, feed, stopped), daemon=True)
     reader.start()
@@ -109,24 +113,37 @@ def play(recording: Recording) -> Play:
         stack.close()
 
 
-def _read(recording: Recording, feed: "queue.Queue[SensorFrame | None]", stopped: threading.Event) -> None:
-    """Unpack frames until the end, or until told to stop."""
-    for frame in recording.sensor_frames():
+def _read(recording: Recording, feed: Feed, stopped: threading.Event) -> None:
+    """Unpack frames until the end, or until told to stop; what cannot be read ends the feed with its error."""
+
+    def put(item: SensorFrame | Exception | None) -> None:
         while not stopped.is_set():
-            try:
-                feed.put(frame, timeout=0.1)
-                break
-            except queue.Full:
-                continue
-        if stopped.is_set():
-            return
-    feed.put(None)
+            with suppress(queue.Full):
+                feed.put(item, timeout=0.1)
+                return
+
+    try:
+        for frame in recording.sensor_frames():
+            put(frame)
+            if stopped.is_set():
+                return
+    except Exception as error:  # whatever it is, the thread that plays waits for it
+        put(error)
+    put(None)
 
 
-def _play(stack: PerceptionStack, feed: "queue.Queue[SensorFrame | None]") -> Play:
+def _take(feed: Feed) -> SensorFrame | None:
+    """The next frame, None at the end; raises what the reader has met."""
+    item = feed.get()
+    if isinstance(item, Exception):
+        raise item
+    return item
+
+
+def _play(stack: PerceptionStack, feed: Feed) -> Play:
     outcome = Play()
     waiting: deque[SensorFrame] = deque()
-    ahead = feed.get()
+    ahead = _take(feed)
     if ahead is None:
         return outcome
     first = ahead.stamp
@@ -136,7 +153,7 @@ def _play(stack: PerceptionStack, feed: "queue.Queue[SensorFrame | None]") -> Pl
         now = first + round((time.perf_counter() - begin) * NANOSECONDS)
         while ahead is not None and ahead.stamp <= now:  # all that has arrived meanwhile
             waiting.append(ahead)
-            ahead = feed.get()
+            ahead = _take(feed)
         if not waiting:
             assert ahead is not None
             time.sleep(max(0.0, (ahead.stamp - now) / NANOSECONDS))

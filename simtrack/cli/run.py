@@ -29,7 +29,7 @@ def run(
 
     Args:
         scene: Name of a scene (see `simtrack scenes`), or path of its folder or YAML file.
-        duration: Simulated seconds; the scene's own (20 for most) if not given.
+        duration: Simulated seconds; the scene's own (30 for the workbench) if not given.
         seed: Of everything random.
         out: Folder for the results; runs/SCENE-SEED if not given.
         agent: What decides where the robot looks and drives: explorer, fixed-gaze, route; the scene's own if not given.
@@ -47,6 +47,7 @@ def run(
     restore_collector = relax_collector()
     from simtrack.cli import console
     from simtrack.evaluation.closed_loop import ClosedLoopRun
+    from simtrack.evaluation.rehearsal import rehearse
     from simtrack.evaluation.run_config import RunConfig
     from simtrack.report.page import write_report
     from simtrack.simulation.scene_file import load_scene
@@ -64,6 +65,7 @@ def run(
             restore_collector()
             line.update(progress)
 
+        rehearse(scene, renderer, line.say)
         record = ClosedLoopRun(config, show, observers, started=process_start()).run()
     write_report(record, folder / "report.html")
     _summarise(record)

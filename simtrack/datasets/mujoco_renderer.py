@@ -107,6 +107,7 @@ def _compile(content: Content, intrinsics: CameraIntrinsics, samples: int) -> "m
 
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
+    spec.compiler.usethread = False  # see `simtrack.datasets.local.thread_limits`
     visual = spec.visual
     visual.global_.offwidth, visual.global_.offheight = intrinsics.width, intrinsics.height
     visual.quality.offsamples = 0 if samples == 1 else samples

@@ -118,25 +118,36 @@ def _above(
 
     `top` is the height of the heap above the face, metres.
     """
-    poses = np.tile(np.eye(4), (len(bodies), 1, 1))
-    taken: list[tuple[Float64, float]] = []
-    for k in which:
-        body = bodies[k]
-        rotation = _rotation(rng.random() < placement.upright, rng)
-        radius = float(np.linalg.norm(body.extents)) / 2
-        low = float(np.abs(rotation[2]) @ body.extents) / 2 + top
-        start = rng.uniform(*placement.height)
-        for attempt in range(TRIES):
-            at = np.array([rng.uniform(*area.x), rng.uniform(*area.y), low + start + 0.02 * (attempt // 4)])
-            if all(np.linalg.norm(at - other) > radius + reach for other, reach in taken):
+    stuck = ""
+    for _ in range(RESTARTS):
+        poses = np.tile(np.eye(4), (len(bodies), 1, 1))
+        taken: list[tuple[Float64, float]] = []
+        for k in which:
+            body, radius = bodies[k], float(np.linalg.norm(bodies[k].extents)) / 2
+            rotation = _rotation(rng.random() < placement.upright, rng)
+            low = float(np.abs(rotation[2]) @ body.extents) / 2 + top
+            if (at := _free_point(area, low + rng.uniform(*placement.height), radius, taken, rng)) is None:
+                stuck = f"'{body.name}' (box {_size(body)} m)"
                 break
+            taken.append((at, radius))
+            poses[k] = area.T_map_face @ transform(rotation, at)
         else:
-            raise PlacementError(
-                f"'{body.name}' (box {_size(body)} m) finds no free place to fall from in {TRIES} tries"
-            )
-        taken.append((at, radius))
-        poses[k] = area.T_map_face @ transform(rotation, at)
-    return poses
+            return poses
+    raise PlacementError(
+        f"{stuck} finds no free place to fall from, {RESTARTS} times {TRIES} tries; "
+        "allowed: a larger area, fewer or smaller things"
+    )
+
+
+def _free_point(
+    area: Area, height: float, radius: float, taken: Sequence[tuple[Float64, float]], rng: np.random.Generator
+) -> Float64 | None:
+    """(3,), above the face, or a little higher with every few tries: a ball there touches none that is taken."""
+    for attempt in range(TRIES):
+        at = np.array([rng.uniform(*area.x), rng.uniform(*area.y), height + 0.02 * (attempt // 4)])
+        if all(np.linalg.norm(at - other) > radius + reach for other, reach in taken):
+            return at
+    return None
 
 
 def _rotation(upright: bool, rng: np.random.Generator) -> Float64:
@@ -181,6 +192,7 @@ class _Drop:
         self._bodies, self._area = bodies, area
         spec = mujoco.MjSpec()
         spec.compiler.degree = False
+        spec.compiler.usethread = False  # see `simtrack.datasets.local.thread_limits`
         spec.option.timestep = TIMESTEP
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC

@@ -28,6 +28,7 @@ from simtrack.geometry import meshes
 from simtrack.geometry.meshes import Mesh
 from simtrack.geometry.transforms import exp_so3, inverse, transform
 from simtrack.objects.cache import cached_model, digest
+from simtrack.objects.decomposition import convex_parts
 from simtrack.objects.model import ObjectModel, Symmetries, SymmetryAxis, build_model
 from simtrack.objects.semantics import SEMANTIC_CLASSES
 
@@ -227,25 +228,10 @@ def convex_parts(kind: str, mesh: Mesh, path: Path) -> list[Mesh]:
     if kind == "convex-hull":
         return [meshes.convex_hull(mesh.vertices)]
     try:
-        import coacd
-    except ImportError as error:
-        reason = "coacd needs the package of that name (pip install coacd); allowed without it: convex-hull, box"
+        return convex_parts(mesh, path)
+    except MeshError as error:
+        reason = f"{error.reason}; allowed without it: convex-hull, box"
         raise FileFormatError(path.parent / FILE_NAME, "collision", reason) from error
-    coacd.set_log_level("error")
-    # Coarse on purpose: a 300 mm crate takes 4 s and keeps its hollow; the default settings take minutes.
-    light = meshes.decimate(mesh, MAX_VISUAL_FACES)
-    parts = coacd.run_coacd(
-        coacd.Mesh(light.vertices, light.faces),
-        threshold=0.1,
-        max_convex_hull=32,
-        preprocess_resolution=30,
-        resolution=500,
-        mcts_nodes=10,
-        mcts_iterations=50,
-        mcts_max_depth=2,
-        seed=0,
-    )
-    return [meshes.convex_hull(np.asarray(vertices)) for vertices, _ in parts]
 
 
 def _symmetries(specification: ObjectSpecification, centre: Float64) -> Symmetries:

@@ -181,7 +181,10 @@ def gl_context(intrinsics: CameraIntrinsics) -> "GLContext":
 
         gl = GLContext(intrinsics.width, intrinsics.height)
     except Exception as error:  # PyOpenGL raises what it likes: AttributeError, ImportError, EGLError, RuntimeError
-        raise RenderingError(f"OpenGL cannot be used without a display here (EGL: {error!r:.120}).") from error
+        needed = "it takes libEGL and a driver such as Mesa's (Debian: apt install libegl1 libgl1-mesa-dri)"
+        raise RenderingError(
+            f"OpenGL cannot be used without a display here: {needed}. EGL says {error!r:.120}."
+        ) from error
     gl.make_current()
     return gl
 

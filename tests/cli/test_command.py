@@ -1,35 +1,17 @@
 """The command: fast help, clear refusals, exit codes."""
 
-import os
 import resource
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import simtrack
-
-ROOT = Path(__file__).parents[2]
-
-
-def simtrack_command(*arguments: object, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100", "NO_COLOR": "1", **(env or {})}
-    command = [sys.executable, "-m", "simtrack", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, check=False)
-
-
-def refused(*arguments: object, env: dict[str, str] | None = None) -> str:
-    """The message of a command that has to fail with exit code 2 and without a traceback."""
-    result = simtrack_command(*arguments, env=env)
-    assert result.returncode == 2, result.stdout + result.stderr
-    assert "Traceback" not in result.stderr
-    return " ".join(result.stderr.split())
+from tests.cli.commands import refusal, refused, simtrack_command, simtrack_process
 
 
 def test_help_is_quick_and_names_the_verbs() -> None:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    result = simtrack_command("--help")
+    result = simtrack_process("--help")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert result.returncode == 0
     for verb in ("run", "replay", "scenes", "objects", "query", "trials"):
@@ -39,7 +21,7 @@ def test_help_is_quick_and_names_the_verbs() -> None:
 
 
 def test_version() -> None:
-    assert simtrack_command("--version").stdout.strip() == f"simtrack {simtrack.__version__}"
+    assert simtrack_process("--version").stdout.strip() == f"simtrack {simtrack.__version__}"
 
 
 def test_every_verb_has_help() -> None:
@@ -57,7 +39,7 @@ def test_scenes_are_listed() -> None:
 
 
 def test_unknown_names_list_the_known(tmp_path: Path) -> None:
-    assert "Known: lab_floor, workbench" in refused("run", "nowhere", "--out", tmp_path / "x")
+    assert "Known: lab_floor, workbench" in refusal(simtrack_process("run", "nowhere", "--out", tmp_path / "x"))
     assert "explorer" in refused("run", "--agent", "nobody", "--out", tmp_path / "x")
     assert "oracle" in refused("run", "--detector", "psychic", "--out", tmp_path / "x")
     assert "multimeter" in refused("objects", "unobtainium")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from simtrack.cli.main import main
-from tests.cli.test_command import ROOT, refused, simtrack_command
+from tests.cli.commands import ROOT, refused, simtrack_command
 from tests.datasets.tiny import tree
 
 RECIPE = """

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.test_command import refused, simtrack_command
+from tests.cli.commands import refused, simtrack_command
 from tests.recordings.samples import World, camera_path, write_tum
 
 

@@ -306,3 +306,26 @@ def test_a_closed_pool_leaves_no_process(tmp_path: Path) -> None:
     processes = [worker.process for worker in pool._workers]
     pool.close()
     assert [process.exitcode for process in processes] == [-signal.SIGKILL] * 2
+
+
+RAISES = """
+import sys
+from pathlib import Path
+from simtrack.datasets.local import LocalPool
+from tests.datasets.tiny import PlainWriter, TinyFactory
+if __name__ == "__main__":
+    pool = LocalPool(TinyFactory(delay=600.0), (PlainWriter(),), 1)
+    pool.start(0, Path(sys.argv[1]))
+    raise RuntimeError("in the middle")
+"""
+
+
+def test_a_script_that_raises_does_not_wait_for_its_workers(tmp_path: Path) -> None:
+    script = tmp_path / "raises.py"
+    script.write_text(RAISES)
+    command = [sys.executable, str(script), str(tmp_path / "a")]
+    done = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=90
+    )
+    assert done.returncode == 1
+    assert done.stderr.endswith("RuntimeError: in the middle\n")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from simtrack.contracts import Room
-from simtrack.datasets.physics import Body, PlacementError, settle
+from simtrack.datasets.physics import Body, PlacementError, _above, settle
 from simtrack.datasets.primitives import box_mapping, primitive
 from simtrack.datasets.recipe import PRIMITIVES, ArrangePlacement, DropPlacement, PrimitiveSettings
 from simtrack.geometry import meshes
@@ -56,6 +56,21 @@ def test_dropped_things_rest_on_the_table_or_on_one_another(static: StaticWorld,
         assert lowest(body, T) > HEIGHT - 0.004
         if {below for above, below in settled.support if above == body.name} == {"table"}:
             assert lowest(body, T) < HEIGHT + 0.004
+
+
+def test_a_crowded_beginning_is_begun_again() -> None:
+    """Four crates over a small area often leave no place for the last one; what cannot fit at all is named."""
+    area, placement = Area(np.eye(4), (-0.15, 0.15), (-0.15, 0.15), np.full(2, 0.3)), DropPlacement(kind="drop")
+    crates = [Body(f"crate-{k}", load_object("klt3147"), 1.0) for k in range(12)]
+    reach = np.linalg.norm(crates[0].extents)
+    for seed in range(30):
+        at = _above(crates[:4], area, placement, range(4), 0.0, np.random.default_rng(seed))[:, :3, 3]
+        apart = np.linalg.norm(at[:, None] - at[None], axis=2)[np.triu_indices(4, 1)]
+        assert (apart > reach).all()
+    with pytest.raises(
+        PlacementError, match=r"'crate-\d+' \(box .*fall from, 5 times 200 tries; allowed: a larger area"
+    ):
+        _above(crates, area, placement, range(12), 0.0, np.random.default_rng(0))
 
 
 def test_one_stream_gives_the_same_heap(static: StaticWorld) -> None:

@@ -1,3 +1,4 @@
+import sys
 from collections.abc import Callable, Iterator
 from typing import TypeAlias
 
@@ -6,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from simtrack.contracts import Command
+from simtrack.contracts import CameraIntrinsics, Command
 from simtrack.errors import InvalidValueError, RenderingError
 from simtrack.simulation import rendering
 from simtrack.simulation.rendering import EmbreeRenderer, MujocoRenderer, make_renderer
@@ -100,6 +101,12 @@ def test_without_egl_one_warning_and_rays(resting: Simulation, monkeypatch: pyte
         renderer = make_renderer("mujoco", resting.world, resting._rays, resting.camera.intrinsics, FAR)
     assert renderer.name == "embree"
     assert len(caught) == 1
+
+
+def test_what_opengl_needs_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco.egl", None)
+    with pytest.raises(RenderingError, match=r"libEGL and a driver .*apt install.*EGL says ModuleNotFoundError"):
+        rendering.gl_context(CameraIntrinsics(64, 48, 60.0, 60.0, 31.5, 23.5))
 
 
 def test_unknown_renderer(resting: Simulation) -> None:

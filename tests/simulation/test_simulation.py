@@ -30,6 +30,18 @@ def advance(simulation: Simulation, frames: int, command: Command = LOOK, rgb: b
     return [frame for _ in range(frames) for frame in simulation.advance(command, rgb)]
 
 
+def close_eyes(simulation: Simulation, monkeypatch: pytest.MonkeyPatch, *senders: str) -> None:
+    """Physics alone: images are black, and what `senders` are called sends nothing."""
+    intrinsics = simulation.camera.intrinsics
+    black = np.zeros((intrinsics.height, intrinsics.width), np.float32)
+    monkeypatch.setattr(
+        simulation, "_take_image", lambda stamp, rgb: RgbdFrame(stamp, black, None, intrinsics, np.eye(4))
+    )
+    monkeypatch.setattr(simulation, "_draw_noise", lambda: None)
+    for name in ("_send_scan", *senders):
+        monkeypatch.setattr(simulation, name, lambda stamp: None)
+
+
 def same(a: SensorFrame, b: SensorFrame) -> bool:
     if type(a) is not type(b):
         return False
@@ -101,10 +113,12 @@ def test_sensors_see_the_truth_when_nothing_disturbs_them(small_scene: MakeScene
         assert np.abs(moved - read).max() < 1e-3
 
 
-def test_the_robot_keeps_to_its_limits_and_does_not_slide(small_scene: MakeScene) -> None:
+def test_the_robot_keeps_to_its_limits_and_does_not_slide(
+    small_scene: MakeScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = small_scene(robot={"start": {"x": 2.6, "y": 2.0, "yaw": 0.4}}, objects=[], clutter=[])
     with Simulation(scene, seed=0, renderer="embree") as simulation:
-        simulation._send_image = lambda *_: None  # type: ignore[method-assign]
+        close_eyes(simulation, monkeypatch)
         poses, heads = [], []
         for k in range(90):
             simulation.advance(Command(9.0 if k < 30 else 0.0, -9.0, 1.2, -0.9, 0.35))
@@ -129,9 +143,9 @@ def test_the_robot_keeps_to_its_limits_and_does_not_slide(small_scene: MakeScene
     assert heads[-1]["torso_lift_joint"] > 0.28
 
 
-def test_the_robot_stops_at_the_bench(small_scene: MakeScene) -> None:
+def test_the_robot_stops_at_the_bench(small_scene: MakeScene, monkeypatch: pytest.MonkeyPatch) -> None:
     with Simulation(small_scene(objects=[], clutter=[]), seed=0, renderer="embree") as simulation:
-        simulation._send_image = lambda *_: None  # type: ignore[method-assign]
+        close_eyes(simulation, monkeypatch)
         advance(simulation, 90, Command(linear=1.0, torso=0.3))
         T = simulation.truth.at(simulation.now).T_map_base
     bench = simulation.world.static.part("workbench")
@@ -165,9 +179,9 @@ def test_visibility_agrees_with_the_id_image(resting: Simulation) -> None:
     assert seen["relay"].fraction > 0.9
 
 
-def test_an_object_leaving_the_image_loses_visibility(small_scene: MakeScene) -> None:
+def test_an_object_leaving_the_image_loses_visibility(small_scene: MakeScene, monkeypatch: pytest.MonkeyPatch) -> None:
     with Simulation(small_scene(), seed=3, renderer="embree") as simulation:
-        simulation._send_image = lambda *_: None  # type: ignore[method-assign]
+        close_eyes(simulation, monkeypatch)
         fractions = []
         for _ in range(30):
             simulation.advance(Command(head_pan=-1.2, head_tilt=-0.3, torso=0.3))
@@ -207,12 +221,11 @@ def test_faults_reach_the_frames(small_scene: MakeScene) -> None:
 
 
 @pytest.mark.parametrize("seed", [1])
-def test_the_hand_moves_things_as_asked(seed: int) -> None:
+def test_the_hand_moves_things_as_asked(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Picks, carries, puts down gently and pushes; never throws."""
     scene = load_scene("workbench")
     with Simulation(scene, seed, renderer="embree") as simulation:
-        for sensor in ("_send_image", "_send_scan", "_send_proprioception"):
-            setattr(simulation, sensor, lambda *_: None)
+        close_eyes(simulation, monkeypatch, "_send_proprioception")
         start = simulation.truth.at(0).objects
         fastest, spin, tilt = 0.0, 0.0, 0.0
         objects = start

@@ -96,7 +96,8 @@ def _neighbours(world, slots, moved, shift):
     shifts = np.full(world.centres.shape[0], -1.0)
     for row in range(moved.shape[0]):
         i = moved[row]
-        spheres[row, :3] = world.centres[i]
+        for k in range(3):
+            spheres[row, k] = world.centres[i, k]
         spheres[row, 3] = world.reach[i] + shift[row]
         spheres[row, 4] = world.radii[i] + shift[row]
         shifts[i] = shift[row]
@@ -114,7 +115,8 @@ def _neighbours(world, slots, moved, shift):
                 continue
             if count == pairs.shape[0]:
                 longer = np.empty((2 * count, 2), np.int64)
-                longer[:count] = pairs
+                for old in range(count):
+                    longer[old, 0], longer[old, 1] = pairs[old, 0], pairs[old, 1]
                 pairs = longer
             pairs[count, 0] = i
             pairs[count, 1] = j

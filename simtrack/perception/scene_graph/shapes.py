@@ -180,7 +180,10 @@ def _water_level(ground):
     """
     nu, nv = ground.shape
     level = np.full((nu + 2, nv + 2), -np.inf)
-    level[1:-1, 1:-1] = np.where(ground == -np.inf, -np.inf, np.inf)
+    for i in range(nu):  # element by element: whole arrays would take ten times as long to compile
+        for j in range(nv):
+            if ground[i, j] != -np.inf:
+                level[i + 1, j + 1] = np.inf
     sweep = 0
     falls = True
     while falls:

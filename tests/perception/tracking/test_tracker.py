@@ -1,4 +1,6 @@
 import importlib.util
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -162,3 +164,20 @@ def test_unusable_frames_are_statuses() -> None:
         h = PoseHypothesis("teapot", stamp, np.eye(4), np.eye(6), 1.0, 1.0)
         film.tracker.update(film.world.frame(stamp + PERIOD), scenes.T_MAP_CAMERA, scenes.COVARIANCE, [h])
     film.tracker.close()
+
+
+RAISES = """
+from tests.perception.tracking.test_tracker import Film
+film = Film("relay")
+film.put("relay", 0.0, 0.0, 0.0)
+while film.tracker._claims._current is None:
+    film.run(1)
+raise RuntimeError("in the middle")
+"""
+
+
+def test_a_script_that_raises_ends_though_a_claim_is_worked_at() -> None:
+    root = Path(__file__).resolve().parents[3]
+    done = subprocess.run([sys.executable, "-c", RAISES], cwd=root, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 1
+    assert done.stderr.endswith("RuntimeError: in the middle\n")

@@ -37,10 +37,11 @@ def test_no_ray_gets_into_a_region_that_was_not_expected(seed: int, radius: floa
             origin = sensor + radius * rng.random() * directions(rng, 1)[0]
             if not len(regions.containing(origin)):
                 continue
-            for region, travelled in passed(regions, origin, ray, reach):
+            path = passed(regions, origin, ray, reach)
+            for region, travelled in path:
                 assert region in bound
                 assert bound[region] <= travelled + radius + 1e-6
-                entered += region != passed(regions, origin, ray, 0.0)[0][0]
+                entered += region != path[0][0]
     assert entered > 30
 
 
