@@ -6,91 +6,89 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from simtrack.contracts import Float64, Relation, Room
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.geometry.transforms import is_rigid
 from simtrack.perception.scene_graph.facts import Entity, Layer, SceneFacts
 from simtrack.perception.scene_graph.history import History, Interval
+from simtrack.perception.scene_graph.json_schema import (
+    JsonModel,
+    Matrix,
+    Name,
+    Number,
+    Positive,
+    Triple,
+    parse_document,
+    read_bounded,
+)
 from simtrack.perception.scene_graph.relations import RELATIONS, RelationConfig
 from simtrack.perception.scene_graph.shapes import Interior, Shape, box_shape
 
 FORMAT = "simtrack-scene-graph"
 VERSION = 1
-MAX_BYTES = 512 * 1024 * 1024
-"""Larger files are refused before they are read."""
 
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-_Triple = tuple[_Number, _Number, _Number]
-_Size = tuple[_Positive, _Positive, _Positive]
-_Row = tuple[_Number, _Number, _Number, _Number]
-_Matrix = tuple[_Row, _Row, _Row, _Row]
-_Name = Annotated[str, Field(min_length=1, max_length=256)]
+_Size = tuple[Positive, Positive, Positive]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=False)
+class _Room(JsonModel):
+    name: Name
+    polygon: Annotated[list[tuple[Number, Number]], Field(min_length=3)]
+    floor: Number
+    height: Positive
 
 
-class _Room(_Model):
-    name: _Name
-    polygon: Annotated[list[tuple[_Number, _Number]], Field(min_length=3)]
-    floor: _Number
-    height: _Positive
-
-
-class _Interior(_Model):
-    centre: _Triple
+class _Interior(JsonModel):
+    centre: Triple
     extents: _Size
 
 
-class _Entity(_Model):
-    name: _Name
+class _Entity(JsonModel):
+    name: Name
     layer: Layer
     class_name: str
     semantic_class: str
-    T_map: _Matrix
+    T_map: Matrix
     extents: _Size
     room: str
     parent: str
-    T_parent_entity: _Matrix
+    T_parent_entity: Matrix
     carried: bool
     layout: bool = False
     interior: _Interior | None = None
 
 
-class _Known(_Model):
-    name: _Name
+class _Known(JsonModel):
+    name: Name
     class_name: str
     semantic_class: str
     layer: Layer
 
 
-class _Relation(_Model):
-    subject: _Name
+class _Relation(JsonModel):
+    subject: Name
     name: Literal[RELATIONS]  # pyright: ignore[reportInvalidTypeForm]
-    reference: _Name
+    reference: Name
     intervals: Annotated[list[tuple[int, int | None]], Field(min_length=1)]
 
 
-class _Config(_Model):
+class _Config(JsonModel):
     projection: bool
     strict: bool
-    projection_factor: _Number
-    on_distance: _Number
-    near_range: _Number
-    touch_distance: _Number
-    intersection_depth: _Number
-    meet_depth: _Number
-    enter_margin: _Number
-    leave_margin: _Number
+    projection_factor: Number
+    on_distance: Number
+    near_range: Number
+    touch_distance: Number
+    intersection_depth: Number
+    meet_depth: Number
+    enter_margin: Number
+    leave_margin: Number
     container_classes: frozenset[str]
     layout_classes: frozenset[str]
 
 
-class _Graph(_Model):
+class _Graph(JsonModel):
     format: Literal["simtrack-scene-graph"]
     version: Literal[1]
     stamp: int
@@ -163,13 +161,7 @@ def load(path: str | Path) -> SceneFacts:
         FileFormatError: the file cannot be read or is not of the schema.
     """
     path = Path(path)
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise FileFormatError(path, "", f"larger than {MAX_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(path, "", f"cannot be read: {error}") from None
-    return parse(text, path)
+    return parse(read_bounded(path), path)
 
 
 def parse(text: str, source: str | Path) -> SceneFacts:
@@ -178,11 +170,7 @@ def parse(text: str, source: str | Path) -> SceneFacts:
     Raises:
         FileFormatError: the text is not of the schema, names its field and reason.
     """
-    try:
-        graph = _Graph.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise FileFormatError(source, ".".join(map(str, first["loc"])), first["msg"]) from None
+    graph = parse_document(_Graph, text, source)
     rooms = [Room(r.name, np.array(r.polygon), r.floor, r.height) for r in graph.rooms]
     entities = {e.name: _entity(e, i, source) for i, e in enumerate(graph.entities)}
     _require_unique([e.name for e in graph.entities] + [e.name for e in graph.past_entities], "entities", source)

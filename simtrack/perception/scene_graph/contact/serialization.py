@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field
 
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.geometry.boxes import OrientedBox
@@ -19,74 +19,71 @@ from simtrack.perception.scene_graph.contact.graph import (
     SupportKind,
 )
 from simtrack.perception.scene_graph.contact.nodes import SCENE, EntityKind, EntityNode, Finding, FindingCode
+from simtrack.perception.scene_graph.json_schema import (
+    JsonModel,
+    Matrix,
+    Name,
+    Number,
+    Positive,
+    Triple,
+    parse_document,
+    read_bounded,
+)
 
 FORMAT = "simtrack-contact-graph"
 VERSION = 1
-MAX_BYTES = 256 * 1024 * 1024
-"""Larger files are refused before they are read."""
-
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-_Triple = tuple[_Number, _Number, _Number]
-_Row = tuple[_Number, _Number, _Number, _Number]
-_Matrix = tuple[_Row, _Row, _Row, _Row]
-_Name = Annotated[str, Field(min_length=1, max_length=256)]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class _Plane(_Model):
-    normal: _Triple
-    offset: _Number
+class _Plane(JsonModel):
+    normal: Triple
+    offset: Number
     area: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
     hidden: bool
 
 
-class _Node(_Model):
-    name: _Name
+class _Node(JsonModel):
+    name: Name
     semantic_class: str
     kind: EntityKind
-    T_map_entity: _Matrix
-    T_map_box: _Matrix
-    extents: tuple[_Positive, _Positive, _Positive]
+    T_map_entity: Matrix
+    T_map_box: Matrix
+    extents: tuple[Positive, Positive, Positive]
     planes: list[_Plane]
 
 
-class _Support(_Model):
-    child: _Name
+class _Support(JsonModel):
+    child: Name
     parent: str
     kind: SupportKind
     plane: int
-    height: _Number | None
-    distance: _Number | None
-    area: _Number
-    score: _Number
+    height: Number | None
+    distance: Number | None
+    area: Number
+    score: Number
     touching: bool
 
 
-class _Leaning(_Model):
-    child: _Name
-    against: _Name
-    point: _Triple
+class _Leaning(JsonModel):
+    child: Name
+    against: Name
+    point: Triple
 
 
-class _Proximal(_Model):
-    first: _Name
-    second: _Name
-    box_volume: _Number
-    volume: _Number
+class _Proximal(JsonModel):
+    first: Name
+    second: Name
+    box_volume: Number
+    volume: Number
     exact: bool
 
 
-class _Finding(_Model):
+class _Finding(JsonModel):
     code: FindingCode
     entity: str
     message: str
 
 
-class _Graph(_Model):
+class _Graph(JsonModel):
     format: Literal["simtrack-contact-graph"]
     version: Literal[1]
     nodes: list[_Node]
@@ -139,13 +136,7 @@ def load_contact_graph(path: str | Path) -> ContactGraph:
         FileFormatError: the file cannot be read, is not of the schema, or its supports are no tree.
     """
     path = Path(path)
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise FileFormatError(path, "", f"larger than {MAX_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(path, "", f"cannot be read: {error}") from None
-    return parse_contact_graph(text, path)
+    return parse_contact_graph(read_bounded(path), path)
 
 
 def parse_contact_graph(text: str, source: str | Path) -> ContactGraph:
@@ -154,11 +145,7 @@ def parse_contact_graph(text: str, source: str | Path) -> ContactGraph:
     Raises:
         FileFormatError: the text is not of the schema, or its supports are no tree; names field and reason.
     """
-    try:
-        data = _Graph.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise FileFormatError(source, ".".join(map(str, first["loc"])), first["msg"]) from None
+    data = parse_document(_Graph, text, source)
     nodes: dict[str, EntityNode] = {}
     for i, node in enumerate(data.nodes):
         if node.name in nodes:
