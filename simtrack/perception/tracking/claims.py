@@ -1,19 +1,18 @@
 """Detections that need a registration of their own: of a new object, or of a known one that they see otherwise.
 
-Such a registration tries many starts and takes longer than a frame lasts. It is done beside the frames, one at a time,
-and its answer is used a fixed time of the sensor's clock later: what the tracker does never depends on how fast the
-machine is, and where it is fast enough, no frame waits.
+Such a registration tries many starts and takes longer than a frame lasts. It is done beside the frames, one at a time
+(see `simtrack.perception.beside`).
 """
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
-import numba as nb
 import numpy as np
 
-from simtrack.contracts import NANOSECONDS, Float64, PoseHypothesis
+from simtrack.contracts import Float64, PoseHypothesis
+from simtrack.perception.beside import Beside, worker
 from simtrack.perception.tracking.birth import Occluders, Prober
 from simtrack.perception.tracking.registration import RegistrationResult, TrackedModel
 from simtrack.perception.tracking.target import Target, View
@@ -48,14 +47,14 @@ class ClaimQueue:
     def __init__(self, prober: Prober, models: Mapping[str, TrackedModel], seconds: float) -> None:
         """`prober` belongs to the thread while a claim is worked at; answers are used after `seconds`."""
         self._prober, self._models = prober, models
-        self._period = round(seconds * NANOSECONDS)
         self._waiting: deque[Claim] = deque()
-        self._current: tuple[Claim, int, Future[RegistrationResult | None]] | None = None
-        self._executor: ThreadPoolExecutor | None = None
+        self._current: Claim | None = None
+        self._thread = worker("claims")
+        self._beside = Beside[RegistrationResult | None](self._thread, seconds)
 
     def add(self, claim: Claim) -> None:
         """Queue a claim. It takes the turn of an older one about the same thing, or is dropped if that is at work."""
-        if self._current is not None and self._same(claim, self._current[0]):
+        if self._current is not None and self._same(claim, self._current):
             return
         for k, other in enumerate(self._waiting):
             if self._same(claim, other):
@@ -65,11 +64,10 @@ class ClaimQueue:
 
     def settle(self, stamp: int) -> tuple[Claim, RegistrationResult | None] | None:
         """The claim at work and the fit that was found, once its time is up at `stamp`; waits for it if need be."""
-        if self._current is None or stamp - self._current[1] < self._period:
+        if self._current is None or not self._beside.due(stamp):
             return None
-        claim, _, answer = self._current
-        self._current = None
-        return claim, answer.result()
+        claim, self._current = self._current, None
+        return claim, self._beside.settle()
 
     def work(self, stamp: int, oldest: int, occluders: Callable[[Claim], Occluders]) -> None:
         """Begin with the next claim whose image is not older than `oldest`, if none is at work."""
@@ -77,20 +75,17 @@ class ClaimQueue:
             claim = self._waiting.popleft()
             if claim.view.stamp < oldest or (claim.target is not None and not claim.target.alive):
                 continue
-            if self._executor is None:
-                threads = nb.get_num_threads()  # of the calling thread; new threads have a number of their own
-                self._executor = ThreadPoolExecutor(1, "simtrack-claims", nb.set_num_threads, (threads,))
             view, model = claim.view, self._models[claim.class_name]
             arguments = claim.group, model, view.depth, view.intrinsics, occluders(claim)
-            self._current = claim, stamp, self._executor.submit(self._prober.best, *arguments)
+            self._current = claim
+            self._beside.begin(stamp, partial(self._prober.best, *arguments))
 
     def close(self) -> None:
         """End the thread, when it is done with its claim."""
         self._waiting.clear()
         self._current = None
-        if self._executor is not None:
-            self._executor.shutdown()
-            self._executor = None
+        self._beside.drop()
+        self._thread.shutdown()
 
     def _same(self, a: Claim, b: Claim) -> bool:
         if a.target is not None and b.target is not None:

@@ -157,12 +157,22 @@ def presegment_lidar(
 
 def shot_rays(scan: LidarScan, pose_at: Callable[[int], Float64]) -> tuple[Float32, Float32]:
     """Origins and unit directions (N, 3) of a scan's shots in the map, each from the sensor's pose at its own time."""
-    last = float(scan.times.max()) if len(scan.times) else 0.0
-    knots = np.linspace(0.0, max(last, 1e-6), 5)
-    poses = np.stack([pose_at(scan.stamp + int(t * 1e9)) @ scan.T_base_lidar for t in knots])
+    knots = _knots(scan)
+    poses = np.stack([pose_at(stamp) @ scan.T_base_lidar for stamp in shot_stamps(scan)])
     origins, directions = np.empty(scan.directions.shape, np.float32), np.empty(scan.directions.shape, np.float32)
     _shoot(scan.directions, scan.times, knots[1], poses, origins, directions)
     return origins, directions
+
+
+def shot_stamps(scan: LidarScan) -> list[int]:
+    """Nanoseconds at which `shot_rays` asks for the pose of the base."""
+    return [scan.stamp + int(t * 1e9) for t in _knots(scan)]
+
+
+def _knots(scan: LidarScan) -> Float64:
+    """Seconds after the scan's stamp between which its motion is taken to be even."""
+    last = float(scan.times.max()) if len(scan.times) else 0.0
+    return np.linspace(0.0, max(last, 1e-6), 5)
 
 
 @njit(cache=True, nogil=True)
