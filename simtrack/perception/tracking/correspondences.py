@@ -83,6 +83,21 @@ class ModelImages(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def _only_readings(depth, out):
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            d = np.float32(depth[v, u])
+            out[v, u] = d if np.float32(0.0) < d < np.inf else np.float32(0.0)
+
+
+def usable_depth(depth: Float32) -> Float32:
+    """(H, W) copy of a depth image in which whatever is no finite, positive reading is 0."""
+    out = np.empty(depth.shape, np.float32)
+    _only_readings(depth, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
 def axial_variance(z: float, cosine: float, pixel_noise: float) -> float:
     """Variance of a structured-light depth reading, m^2.
 

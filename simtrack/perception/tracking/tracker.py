@@ -34,6 +34,7 @@ from simtrack.perception.tracking.association import (
 )
 from simtrack.perception.tracking.birth import Occluders, Prober, believable, cost
 from simtrack.perception.tracking.claims import Claim, ClaimQueue
+from simtrack.perception.tracking.correspondences import usable_depth
 from simtrack.perception.tracking.filter import Measurement, PoseFilter
 from simtrack.perception.tracking.registration import Registration, RegistrationResult
 from simtrack.perception.tracking.target import (
@@ -99,25 +100,24 @@ class ObjectTracker:
                 raise UnknownNameError("object class", h.class_name, self._models)
         if self._views and frame.stamp <= self._views[-1].stamp:
             return TrackerResult(frame.stamp, self._tracks(self._views[-1]), Status.STALE)
-        depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0.0), frame.depth, np.float32(0.0))
-        view = View(frame.stamp, depth.astype(np.float32), frame.intrinsics, T_map_camera, covariance)
+        view = View(frame.stamp, usable_depth(frame.depth), frame.intrinsics, T_map_camera, covariance)
         self._views.append(view)
         while view.stamp - self._views[0].stamp > self.config.buffer * NANOSECONDS:
             self._views.popleft()
-        status = Status.OK if np.any(depth) else Status.NO_DATA
-        self._register(view)
+        status = Status.OK if np.any(view.depth) else Status.NO_DATA
+        self._register(view, status)
         self._take_detections(hypotheses)
         self._settle_claims(view.stamp)
         self._prune(view.stamp)
         return TrackerResult(frame.stamp, self._tracks(view), status)
 
-    def _register(self, view: View) -> None:
+    def _register(self, view: View, status: Status) -> None:
         """Register all living targets to a view and judge each."""
         T_camera_map = inverse(view.T_map_camera)
         living = [t for t in self._targets if t.alive]
         poses = {t.id: T_camera_map @ t.filter.predict(view.stamp).T_map_object for t in living}
         results = {}
-        if np.any(view.depth):
+        if status is not Status.NO_DATA:
             results = self._registration.track(view.depth, view.intrinsics, poses)
         for target in living:
             self._judge(target, view, poses[target.id], results.get(target.id))
