@@ -80,7 +80,7 @@ class StackConfig:
     """Without a scan for this long, seconds, depth images localize the robot."""
     lidar_presegmentation_every: int = 2
     """Every how many-th scan is segmented."""
-    correction_time: float = 0.03
+    correction_time: float = 0.06
     """A scan's correction of the pose is used this long after the scan's last shot, seconds of the sensor's clock."""
     segmentation_time: float = 0.06
     """What is segmented beside the frames is used this long after it was begun, likewise."""
