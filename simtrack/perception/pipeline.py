@@ -7,7 +7,8 @@ Tracking is done on the newest image, by the calling thread; what an image need 
 each in a thread of its own, and taken up a fixed time of the sensor's clock later (`simtrack.perception.beside`):
 
 - *a scan's pose correction*: begun when the scan arrives, with the odometry so far and the tracks of the last image;
-  taken up `correction_time` after the scan's last shot. Until then odometry leads on from the correction before it.
+  taken up `correction_time` after the scan's last shot; until then odometry leads on from the correction before it.
+  Where that one left doubts (after the start, while lost), nothing is better than to wait: it is taken up at once.
 - *segmenting a scan*: begun when its correction is taken up, with the poses of its shots; taken up `segmentation_time`
   after that.
 - *segmenting an image*, one that the detector would take: begun with its pose and its tracks; taken up
@@ -139,6 +140,8 @@ class PerceptionStack:
         self._joints: deque[JointState] = deque(maxlen=64)
         self._scan: LidarScan | None = None
         """Whose correction is at work."""
+        self._sure = False
+        """Whether the last scan left no doubt about the pose."""
         self._segmented: RgbdFrame | None = None
         """Which image is at work."""
         self._lidar: Presegmentation | None = None
@@ -211,6 +214,8 @@ class PerceptionStack:
         self._own_shots, self._scan_joints = None, self._joint_positions(scan.stamp)
         self._scan = scan
         self._correction.begin(end, self.localizer.begin(scan))
+        if not self._sure:
+            self._settle_scan(scan, end)
 
     def _settle_scan(self, scan: LidarScan, now: int) -> None:
         """Take up the correction with a scan, at a stamp."""
@@ -229,6 +234,7 @@ class PerceptionStack:
         """Note how a scan fared; begin to segment it if it is its turn."""
         if localization is not None:
             self._status["localization"] = localization.status
+        self._sure = localization is not None and localization.status is Status.OK
         if localization is None or localization.status in (Status.STALE, Status.NO_DATA, Status.FAILED):
             return
         self._last_scan, self._fresh_scan = scan.stamp, True

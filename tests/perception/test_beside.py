@@ -126,9 +126,14 @@ def test_answers_come_when_their_time_is_up(room: StaticMap) -> None:
         assert belief.camera.regions  # the box
         # The detector gets the image that was segmented, with what was found in it.
         assert (belief.camera.stamp, belief.camera.regions) in detector.calls
-    due = round((0.099 + config.correction_time) * NANOSECONDS)
-    first = next(b.stamp for b in beliefs if b.localization.inlier_share > 0.0)
-    assert due <= first < due + IMAGE
+    vague = [float(np.trace(b.localization.covariance)) for b in beliefs]
+    corrected = [
+        b.stamp for k, b in enumerate(beliefs) if k and vague[k] < vague[k - 1] and b.stamp > 0.4 * NANOSECONDS
+    ]
+    assert corrected
+    lag = round(config.correction_time * NANOSECONDS)
+    for stamp in corrected:  # the pose is sure by now
+        assert any(lag <= stamp - end < lag + IMAGE for end in range(99_000_000, NANOSECONDS, TURN))
 
 
 def test_a_piece_is_settled_once_and_not_before_its_time() -> None:
