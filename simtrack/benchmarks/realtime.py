@@ -100,10 +100,13 @@ def play(recording: Recording) -> Play:
     interval = sys.getswitchinterval()
     try:
         sys.setswitchinterval(SWITCH_INTERVAL)
+        gc.collect()
+        gc.freeze()  # what is loaded by now stays: looking through it again takes longer than a frame lasts
         with Feed(recording.path) as feed:
             return _play(stack, feed)
     finally:
         sys.setswitchinterval(interval)
+        gc.unfreeze()
         stack.close()
 
 
