@@ -429,15 +429,17 @@ class Belief:
     """(4, 4), believed."""
     tracks: tuple[Track, ...]
     camera: Presegmentation | None
-    """Pre-segmentation of this frame's depth, if it was computed."""
+    """Pre-segmentation of the depth image of an earlier frame (see its stamp), with the first belief that it is done
+    for; None otherwise."""
     lidar: Presegmentation | None
-    """Pre-segmentation of the latest scan."""
+    """Pre-segmentation of the latest scan that was segmented (see its stamp)."""
     relations: Set[Relation]
     """Relations that held at `stamp`, between entities named as in the graph (``relay-3``, ``workbench``)."""
     status: Mapping[str, Status] = field(default_factory=dict)
     """Stage name -> how it fared."""
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
-    """Stage name -> wall time spent on this frame. Measured, not simulated."""
+    """Stage name -> wall time spent on this frame, and beside the frames on what was taken up with it. Measured, not
+    simulated."""
 
 
 # --------------------------------------------------------------------------------------------------------------- acting

@@ -92,7 +92,8 @@ class Evaluator:
         unknown = [name for name in truth.at(0).objects if truth.kind_of(name) != "catalogue"]
         self.found = ObjectsFoundEvaluator(truth.names, unknown)
         self.album = Album(0, duration)
-        self._scans: deque[LidarScan] = deque(maxlen=4)
+        self._scans: deque[LidarScan] = deque(maxlen=8)
+        self._images: deque[RgbdFrame] = deque(maxlen=8)
         self._next: dict[str, int] = {"camera": 0, "lidar": 0, "objects": 0}
         self._last_scan = self._last_stamp = -1
         self.advanced = False
@@ -106,6 +107,7 @@ class Evaluator:
         if belief is None or not isinstance(frame, RgbdFrame) or not self.advanced:
             return []
         self._last_stamp = belief.stamp
+        self._images.append(frame)
         truth, visibility = self._truth.at(belief.stamp), self._truth.visibility(belief.stamp)
         self.trajectory.observe(belief.stamp, belief.localization, truth.T_map_base)
         objects = self.tracking.observe(belief.tracks, truth, {name: v.fraction for name, v in visibility.items()})
@@ -113,7 +115,7 @@ class Evaluator:
         if self._due("objects", belief.stamp):
             self.relations.observe(belief.relations, objects, truth)
             self.floor.observe(frame, objects)
-        self._see_camera(frame, belief)
+        self._see_camera(belief)
         self._see_lidar(belief)
         self.album.see(frame, belief, objects)
         return objects
@@ -124,11 +126,13 @@ class Evaluator:
         self._next[what] = stamp + PERIOD
         return True
 
-    def _see_camera(self, frame: RgbdFrame, belief: Belief) -> None:
+    def _see_camera(self, belief: Belief) -> None:
         result = belief.camera
-        if result is None or result.stamp != frame.stamp:
+        frame = None if result is None else next((f for f in self._images if f.stamp == result.stamp), None)
+        if result is None or frame is None:
             return
         self.presegmentation["camera"].count(result)
+        self.album.see_unknown(frame, belief)
         if not self._due("camera", frame.stamp):
             return
         truth, ids = self._truth.at(frame.stamp), self._truth.ids(frame.stamp)

@@ -140,7 +140,19 @@ class Album:
         """Take one camera frame."""
         if frame.rgb is not None:
             self._see_colour(frame, belief, tuple(objects))
-        self._see_unknown(frame, belief)
+
+    def see_unknown(self, frame: RgbdFrame, belief: Belief) -> None:
+        """Take the camera frame whose pre-segmentation a belief brings."""
+        result = belief.camera
+        if result is None or not result.valid or result.unknown.shape != frame.depth.shape:
+            return
+        # A frame tells most in which much is known and some clusters are left; colour decides between equals.
+        tracked = sum(track.believed and track.visible_fraction > VISIBLE for track in belief.tracks)
+        score = 10 * tracked + len(result.regions) + (0.5 if frame.rgb is not None else 0.0)
+        if score > self._camera_score:
+            jpeg = None if frame.rgb is None else encode_jpeg(frame.rgb)
+            self.camera = CameraPicture(frame.stamp, frame.depth.copy(), result.unknown.copy(), jpeg)
+            self._camera_score = score
 
     def see_lidar(self, stamp: int, points: Float32, unknown: Bool, T_map_base: Float64) -> None:
         """Take one scan as (N, 3) points in the map with its (N,) pre-segmentation."""
@@ -178,18 +190,6 @@ class Album:
     def _error(frame: KeyFrame) -> float:
         thing = worst_object(frame)
         return 0.0 if thing is None else thing.translation_error
-
-    def _see_unknown(self, frame: RgbdFrame, belief: Belief) -> None:
-        result = belief.camera
-        if result is None or not result.valid or result.unknown.shape != frame.depth.shape:
-            return
-        # A frame tells most in which much is known and some clusters are left; colour decides between equals.
-        tracked = sum(track.believed and track.visible_fraction > VISIBLE for track in belief.tracks)
-        score = 10 * tracked + len(result.regions) + (0.5 if frame.rgb is not None else 0.0)
-        if score > self._camera_score:
-            jpeg = None if frame.rgb is None else encode_jpeg(frame.rgb)
-            self.camera = CameraPicture(frame.stamp, frame.depth.copy(), result.unknown.copy(), jpeg)
-            self._camera_score = score
 
 
 class RelationTimeline:

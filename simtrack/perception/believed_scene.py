@@ -18,10 +18,22 @@ class BelievedScene:
     """Keeps a `RayScene` in step with the tracks."""
 
     def __init__(self, static_map: StaticMap, models: Mapping[str, ObjectModel]) -> None:
+        self._place(
+            TriangleMesh(static_map.vertices, static_map.faces),
+            {name: TriangleMesh(m.mesh.vertices, m.mesh.faces) for name, m in models.items()},
+        )
+
+    def _place(self, static: TriangleMesh, meshes: Mapping[str, TriangleMesh]) -> None:
         self.scene = RayScene()
-        self.scene.add(TriangleMesh(static_map.vertices, static_map.faces), instance=MAP)
-        self._meshes = {name: TriangleMesh(m.mesh.vertices, m.mesh.faces) for name, m in models.items()}
+        self.scene.add(static, instance=MAP)
+        self._meshes = meshes
         self._placed: dict[int, str] = {}
+
+    def twin(self) -> "BelievedScene":
+        """Another scene of the same meshes, for another thread: only the map is in it yet."""
+        other = BelievedScene.__new__(BelievedScene)
+        other._place(self.scene.mesh(MAP), self._meshes)
+        return other
 
     def close(self) -> None:
         """Release the scene's memory."""

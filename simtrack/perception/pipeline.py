@@ -2,6 +2,21 @@
 
 Every stage is handed in or built from its defaults; none can see ground truth. A stage that fails on a frame says so in
 the belief's status and keeps its state.
+
+Tracking is done on the newest image, by the calling thread; what an image need not wait for is done beside the frames,
+each in a thread of its own, and taken up a fixed time of the sensor's clock later (`simtrack.perception.beside`):
+
+- *a scan's pose correction*: begun when the scan arrives, with the odometry so far and the tracks of the last image;
+  taken up `correction_time` after the scan's last shot; until then odometry leads on from the correction before it.
+  Where that one left doubts (after the start, while lost), nothing is better than to wait: it is taken up at once.
+- *segmenting a scan*: begun when its correction is taken up, with the poses of its shots; taken up `segmentation_time`
+  after that.
+- *segmenting an image*, one that the detector would take: begun with its pose and its tracks; taken up
+  `segmentation_time` after its stamp. Then the detector gets the image, with the regions that nothing explains.
+- *registering a new object*: see `simtrack.perception.tracking.claims`.
+- *poses of detections*: begun with the detector's answer, taken up when that is due.
+
+Which image that is follows from stamps alone: beliefs are the same with one thread and two, fed live and replayed.
 """
 
 import time
@@ -16,6 +31,7 @@ import numpy as np
 from simtrack.contracts import (
     NANOSECONDS,
     Belief,
+    Bool,
     DetectionResult,
     Detector,
     Float64,
@@ -38,15 +54,14 @@ from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import is_rigid, skew
 from simtrack.objects import ObjectModel
 from simtrack.perception.believed_scene import MAP, BelievedScene
+from simtrack.perception.beside import Beside, worker
 from simtrack.perception.detection.runner import DetectorRunner, RunnerConfig
 from simtrack.perception.localization import LocalizerConfig, MeshLocalizer
+from simtrack.perception.localization.measurement import scan_end
+from simtrack.perception.presegmenter import Presegmenter
 from simtrack.perception.scene_graph import SceneGraph, SceneGraphConfig
 from simtrack.perception.self_filter import SelfFilter
-from simtrack.perception.tracking.presegmentation import (
-    PresegmentationConfig,
-    presegment_camera,
-    presegment_lidar,
-)
+from simtrack.perception.tracking.presegmentation import PresegmentationConfig, shot_stamps
 from simtrack.perception.tracking.target import TrackerConfig
 from simtrack.perception.tracking.tracker import ObjectTracker
 
@@ -66,6 +81,10 @@ class StackConfig:
     """Without a scan for this long, seconds, depth images localize the robot."""
     lidar_presegmentation_every: int = 2
     """Every how many-th scan is segmented."""
+    correction_time: float = 0.06
+    """A scan's correction of the pose is used this long after the scan's last shot, seconds of the sensor's clock."""
+    segmentation_time: float = 0.06
+    """What is segmented beside the frames is used this long after it was begun, likewise."""
 
 
 class PerceptionStack:
@@ -104,8 +123,14 @@ class PerceptionStack:
 
         """
         self.config = config or StackConfig()
-        self.believed = BelievedScene(static_map, models)
-        self.self_filter = SelfFilter(robot)
+        self._believed = BelievedScene(static_map, models)
+        self._body = SelfFilter(robot)
+        c = self.config
+        self._presegmenter = Presegmenter(
+            self._believed.twin(), SelfFilter(robot), c.presegmentation, c.segmentation_time, c.segmentation_time
+        )
+        self._correction_thread = worker("localization")
+        self._correction = Beside[Localization](self._correction_thread, c.correction_time)
         self.localizer = localizer or self._mesh_localizer(static_map, T_map_base)
         self.tracker = tracker or ObjectTracker(models, self.config.tracker)
         self.graph = SceneGraph(static_map, models, self.config.scene_graph)
@@ -113,25 +138,35 @@ class PerceptionStack:
         self.on_detection: Callable[[DetectionResult], None] | None = None
         """Called with every answer of the detector as it is given (recorders listen here)."""
         self._joints: deque[JointState] = deque(maxlen=64)
+        self._scan: LidarScan | None = None
+        """Whose correction is at work."""
+        self._sure = False
+        """Whether the last scan left no doubt about the pose."""
+        self._segmented: RgbdFrame | None = None
+        """Which image is at work."""
         self._lidar: Presegmentation | None = None
         self._scans = 0
         self._last_scan: int | None = None
         self._fresh_scan = False
-        self._own_shots: tuple[LidarScan, np.ndarray] | None = None
+        self._scan_joints: dict[str, float] = {}
+        self._own_shots: tuple[LidarScan, Bool] | None = None
         self._belief: Belief | None = None
         self._status: dict[str, Status] = {}
         self._seconds: dict[str, float] = {}
 
     def close(self) -> None:
         """Release the scenes' memory, and end the threads that work beside the frames."""
-        self.believed.close()
+        self._correction.drop()
+        self._correction_thread.shutdown()
+        self._believed.close()
+        self._presegmenter.close()
         self.detections.close()
         if isinstance(self.tracker, ObjectTracker):
             self.tracker.close()
 
     def wants_image(self, stamp: int) -> bool:
         """Whether the colour of an image with this stamp would be looked at."""
-        return self.detections.due(stamp)
+        return self.detections.due(stamp) and not self._presegmenter.image.busy
 
     def process(self, frame: SensorFrame) -> Belief | None:
         """Take one frame, in the order of arrival; returns what is believed after an RGB-D frame."""
@@ -151,7 +186,7 @@ class PerceptionStack:
 
     def _mesh_localizer(self, static_map: StaticMap, T_map_base: Float64 | None) -> MeshLocalizer:
         """MICP-L in the believed scene: what stands before the map is seen, not taken for the map."""
-        scene = self.believed.scene
+        scene = self._believed.scene
         localizer = MeshLocalizer(
             static_map,
             self.config.localizer,
@@ -165,27 +200,49 @@ class PerceptionStack:
         return localizer
 
     def _take_scan(self, scan: LidarScan) -> None:
-        with self._timed("localization"):
-            localization = self._guard("localization", lambda: self.localizer.update(scan), None)
+        """Correct the pose with a scan: beside the frames, unless the localizer is one that cannot."""
+        end = scan_end(scan)
+        if not isinstance(self.localizer, MeshLocalizer):
+            self._scan_joints = self._joint_positions(scan.stamp)
+            with self._timed("localization"):
+                localization = self._guard("localization", lambda: self.localizer.update(scan), None)
+            self._located(scan, localization, end)
+            return
+        if self._scan is not None:
+            self._settle_scan(self._scan, end)
+        self._believed.update(self._belief.tracks if self._belief is not None else ())
+        self._own_shots, self._scan_joints = None, self._joint_positions(scan.stamp)
+        self._scan = scan
+        self._correction.begin(end, self.localizer.begin(scan))
+        if not self._sure:
+            self._settle_scan(scan, end)
+
+    def _settle_scan(self, scan: LidarScan, now: int) -> None:
+        """Take up the correction with a scan, at a stamp."""
+        self._scan = None
+        localization = self._guard("localization", self._corrected, None)
+        self._spent("localization", self._correction.seconds)
+        self._located(scan, localization, now)
+
+    def _corrected(self) -> Localization:
+        assert isinstance(self.localizer, MeshLocalizer)
+        found = self._correction.settle()
+        self.localizer.adopt()
+        return found
+
+    def _located(self, scan: LidarScan, localization: Localization | None, now: int) -> None:
+        """Note how a scan fared; begin to segment it if it is its turn."""
         if localization is not None:
             self._status["localization"] = localization.status
+        self._sure = localization is not None and localization.status is Status.OK
         if localization is None or localization.status in (Status.STALE, Status.NO_DATA, Status.FAILED):
             return
         self._last_scan, self._fresh_scan = scan.stamp, True
         self._scans += 1
-        if self._scans % self.config.lidar_presegmentation_every:
-            return
-        with self._timed("presegmentation"):
-            self._lidar = self._guard("presegmentation", lambda: self._presegment_scan(scan), self._lidar)
-
-    def _presegment_scan(self, scan: LidarScan) -> Presegmentation:
-        return presegment_lidar(
-            scan,
-            lambda stamp: self.localizer.pose_at(stamp).T_map_base,
-            self.believed.scene,
-            self._own_lidar_shots(scan),
-            self.config.presegmentation,
-        )
+        if self._scans % self.config.lidar_presegmentation_every == 0 and not self._presegmenter.scan.busy:
+            poses = {stamp: self.localizer.pose_at(stamp).T_map_base for stamp in shot_stamps(scan)}
+            tracks = self._belief.tracks if self._belief is not None else ()
+            self._presegmenter.begin_scan(now, scan, poses, tracks, self._own_lidar_shots(scan))
 
     def _take_image(self, frame: RgbdFrame) -> Belief:
         if self._belief is not None and frame.stamp <= self._belief.stamp:
@@ -196,6 +253,9 @@ class PerceptionStack:
             return self._repeat() if self._belief is not None else self._nothing(frame.stamp)
         self._status["frame"] = Status.OK if np.any(frame.depth > 0.0) else Status.NO_DATA
 
+        wanted = self.wants_image(frame.stamp)
+        if self._scan is not None and self._correction.due(frame.stamp):
+            self._settle_scan(self._scan, frame.stamp)
         with self._timed("localization"):
             localization = self._locate(frame)
         T_map_camera = localization.T_map_base @ frame.T_base_camera
@@ -205,13 +265,10 @@ class PerceptionStack:
             hypotheses = self._guard("detection", lambda: self.detections.collect(frame.stamp), [])
         with self._timed("tracking"):
             tracked = self._track(frame, T_map_camera, covariance, hypotheses)
-        self.believed.update(tracked.tracks)
-        camera = None
-        if self.detections.due(frame.stamp):
-            with self._timed("presegmentation"):
-                camera = self._guard("presegmentation", lambda: self._presegment_image(frame, T_map_camera), None)
-            with self._timed("detection"):
-                self._detect(frame, camera)
+        camera = self._settle_segmentation(frame.stamp)
+        if wanted:
+            self._segmented = frame
+            self._presegmenter.begin_image(frame, T_map_camera, tracked.tracks, self._joint_positions(frame.stamp))
         with self._timed("scene_graph"):
             relations = self._guard("scene_graph", lambda: self._relate(frame.stamp, tracked), frozenset())
 
@@ -238,9 +295,10 @@ class PerceptionStack:
         if self._last_scan is None:
             self._last_scan = frame.stamp
         silent = frame.stamp - self._last_scan > self.config.lidar_silence * NANOSECONDS
-        if isinstance(self.localizer, MeshLocalizer) and (silent or self._fresh_scan):
+        if isinstance(self.localizer, MeshLocalizer) and self._scan is None and (silent or self._fresh_scan):
             self._fresh_scan = False
             localizer = self.localizer
+            self._believed.update(self._belief.tracks if self._belief is not None else ())
             found = self._guard("localization", lambda: localizer.update_depth(frame), None)
             if found is not None:
                 self._status["localization"] = found.status
@@ -258,9 +316,20 @@ class PerceptionStack:
         self._status["tracking"] = result.status
         return result
 
-    def _presegment_image(self, frame: RgbdFrame, T_map_camera: Float64) -> Presegmentation:
-        own = self._own_pixels(frame)
-        return presegment_camera(frame, T_map_camera, self.believed.scene, own, self.config.presegmentation)
+    def _settle_segmentation(self, now: int) -> Presegmentation | None:
+        """Take up what has been segmented; the detector gets the image, with what nothing explains in it."""
+        scan, image = self._presegmenter.scan, self._presegmenter.image
+        if scan.due(now):
+            self._lidar = self._guard("presegmentation", scan.settle, self._lidar)
+            self._spent("presegmentation", scan.seconds)
+        if self._segmented is None or not image.due(now):
+            return None
+        frame, self._segmented = self._segmented, None
+        camera = self._guard("presegmentation", image.settle, None)
+        self._spent("presegmentation", image.seconds)
+        with self._timed("detection"):
+            self._detect(frame, camera)
+        return camera
 
     def _detect(self, frame: RgbdFrame, camera: Presegmentation | None) -> None:
         result = self.detections.submit(frame, camera.regions if camera is not None else ())
@@ -274,11 +343,11 @@ class PerceptionStack:
     # ---------------------------------------------------------------------------------------------------------- support
 
     def _own_pixels(self, frame: RgbdFrame) -> np.ndarray:
-        return self.self_filter.camera_mask(frame, self._joint_positions(frame.stamp))
+        return self._body.camera_mask(frame, self._joint_positions(frame.stamp))
 
-    def _own_lidar_shots(self, scan: LidarScan) -> np.ndarray:
+    def _own_lidar_shots(self, scan: LidarScan) -> Bool:
         if self._own_shots is None or self._own_shots[0] is not scan:
-            self._own_shots = scan, self.self_filter.lidar_mask(scan, self._joint_positions(scan.stamp))
+            self._own_shots = scan, self._body.lidar_mask(scan, self._scan_joints)
         return self._own_shots[1]
 
     def _joint_positions(self, stamp: int) -> dict[str, float]:
@@ -304,7 +373,10 @@ class PerceptionStack:
         try:
             yield
         finally:
-            self._seconds[stage] = self._seconds.get(stage, 0.0) + time.perf_counter() - start
+            self._spent(stage, time.perf_counter() - start)
+
+    def _spent(self, stage: str, seconds: float) -> None:
+        self._seconds[stage] = self._seconds.get(stage, 0.0) + seconds
 
     def _repeat(self) -> Belief:
         """The last belief again, with the present statuses."""

@@ -116,22 +116,31 @@ class SelfFilter:
             frame: the image, of which depth and T_base_camera are used.
             positions: joint name -> rad or m.
         """
-        return self._own(frame.depth, self.camera_depth(frame, positions)) & (frame.depth > 0)
+        body = self._coarse_depth(frame, positions)
+        if np.isinf(body).all():  # mostly the camera looks elsewhere
+            return np.zeros(frame.depth.shape, np.bool_)
+        return self._own(frame.depth, self._widened(body, frame.depth.shape)) & (frame.depth > 0)
 
     def camera_depth(self, frame: RgbdFrame, positions: Mapping[str, float]) -> Float32:
         """(H, W) predicted depth of the body in metres, inf where none is seen; silhouette widened."""
+        return self._widened(self._coarse_depth(frame, positions), frame.depth.shape)
+
+    def _coarse_depth(self, frame: RgbdFrame, positions: Mapping[str, float]) -> Float32:
+        """Depth of the body in every `stride`-th pixel, metres, inf where none is seen."""
         self._place(positions)
-        stride = self.config.stride
-        key = (frame.intrinsics, stride)
+        key = (frame.intrinsics, self.config.stride)
         if key not in self._bundles:
-            self._bundles[key] = RayBundle.from_camera(frame.intrinsics, stride=stride)
+            self._bundles[key] = RayBundle.from_camera(frame.intrinsics, stride=self.config.stride)
         bundle = self._bundles[key]
         depth = self._scene.cast(bundle, frame.T_base_camera, max_distance=3.0, min_distance=0.05).distances
-        coarse = depth.reshape(bundle.shape)
+        return depth.reshape(bundle.shape)
+
+    def _widened(self, coarse: Float32, shape: tuple[int, ...]) -> Float32:
+        """A coarse image at full resolution, its silhouette widened."""
+        stride = self.config.stride
         for _ in range(-(-self.config.edge // stride)):
             coarse = _nearest_around(coarse)
-        height, width = frame.depth.shape
-        return np.repeat(np.repeat(coarse, stride, axis=0), stride, axis=1)[:height, :width]
+        return np.repeat(np.repeat(coarse, stride, axis=0), stride, axis=1)[: shape[0], : shape[1]]
 
     def _place(self, positions: Mapping[str, float]) -> None:
         posture = tuple(sorted((name, float(value)) for name, value in positions.items()))

@@ -3,6 +3,7 @@
 Needs the extra ``viz``. Entities are named as simtrack's frames: everything below ``map`` is in the map frame.
 """
 
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from simtrack.contracts import NANOSECONDS, Belief, Float64, LidarScan, RgbdFram
 from simtrack.errors import InvalidValueError, SimtrackError
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import apply
+from simtrack.perception.localization.measurement import scan_end
 from simtrack.report.colors import class_colors
 
 if TYPE_CHECKING:
@@ -53,7 +55,9 @@ class RerunLog:
             raise InvalidValueError("view and rrd", str(path), "one of them at a time")
         self._path: list[Float64] = []
         self._known: set[str] = set()
-        self._scan: LidarScan | None = None
+        self._scans: list[LidarScan] = []
+        """Not shown yet: what is believed of them comes later."""
+        self._poses: deque[tuple[int, Float64]] = deque(maxlen=16)
         self._models: Mapping[str, ObjectModel] = {}
         self._colors: Mapping[str, str] = {}
 
@@ -77,7 +81,7 @@ class RerunLog:
     def frame(self, frame: SensorFrame, belief: Belief | None) -> None:
         """Log one frame and the belief after it."""
         if isinstance(frame, LidarScan):
-            self._scan = frame
+            self._scans = [*self._scans[-7:], frame]
         if belief is None or not isinstance(frame, RgbdFrame):
             return
         rr, stream = self._rr, self._stream
@@ -103,8 +107,10 @@ class RerunLog:
         millimetres = np.nan_to_num(1000.0 * frame.depth).clip(0, 65535).astype(np.uint16)
         coarse = millimetres[::DEPTH_STRIDE, ::DEPTH_STRIDE]
         log("depth", rr.DepthImage(coarse, meter=1000.0))
-        if belief.camera is not None:
+        if belief.camera is not None:  # of an earlier image
+            self._stream.set_time("simulated", duration=belief.camera.stamp / NANOSECONDS)
             log("map/camera/image/unknown", rr.SegmentationImage(belief.camera.unknown.astype(np.uint8)))
+            self._stream.set_time("simulated", duration=belief.stamp / NANOSECONDS)
 
     def _log_tracks(self, tracks: tuple[Track, ...]) -> None:
         rr, log = self._rr, self._stream.log
@@ -124,15 +130,19 @@ class RerunLog:
         self._known = shown
 
     def _log_scan(self, belief: Belief) -> None:
-        scan, result = self._scan, belief.lidar
-        if scan is None or result is None or scan.stamp != result.stamp:
+        result = belief.lidar
+        self._poses.append((belief.stamp, belief.localization.T_map_base))
+        scan = next((s for s in self._scans if result is not None and s.stamp == result.stamp), None)
+        if scan is None or result is None:
             return
+        self._scans = [s for s in self._scans if s.stamp > scan.stamp]
+        end = scan_end(scan)
+        T_map_base = min(self._poses, key=lambda pose: abs(pose[0] - end))[1]
         valid = np.isfinite(scan.ranges) & (scan.ranges > 0)
         points = scan.directions[valid].astype(float) * scan.ranges[valid, None]
         colors = np.where(result.unknown[valid, None], (255, 59, 48), (138, 148, 160)).astype(np.uint8)
-        in_map = apply(belief.localization.T_map_base @ scan.T_base_lidar, points)
+        in_map = apply(T_map_base @ scan.T_base_lidar, points)
         self._stream.log("map/lidar", self._rr.Points3D(in_map, colors=colors, radii=0.012))
-        self._scan = None
 
     def _pose(self, entity: str, T: Float64) -> None:
         self._stream.log(entity, self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))

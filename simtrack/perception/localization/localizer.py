@@ -1,9 +1,7 @@
 """The localizer: odometry between scans, MICP-L on every scan, a search when the pose is lost."""
 
-from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -19,29 +17,16 @@ from simtrack.contracts import (
     Status,
 )
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import difference, interpolate, inverse, is_rigid, rotate_covariance
+from simtrack.geometry.transforms import difference, is_rigid, rotate_covariance
 from simtrack.perception.localization.assessment import UNJUDGED
 from simtrack.perception.localization.config import LocalizerConfig
 from simtrack.perception.localization.measurement import Measurement, depth_measurement, deskew, scan_end
-from simtrack.perception.localization.motion import OdometryTrack, propagate
+from simtrack.perception.localization.poses import UNKNOWN, PoseTrack
 from simtrack.perception.localization.recovery import HypothesisSet, start_covariance
 from simtrack.perception.localization.registration import Registration, register
 from simtrack.perception.localization.search import SearchMap, build_search_map, search
 from simtrack.perception.localization.surface import MapSurface
 from simtrack.raycast import RayScene
-
-UNKNOWN = np.diag(np.square([100.0, 100.0, 1.0, 0.1, 0.1, 3.0]))
-"""(6, 6) covariance of a pose that is not known."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Anchor:
-    """A corrected pose."""
-
-    stamp: int
-    T_map_base: Float64
-    covariance: Float64
-    T_map_odom: Float64
 
 
 class MeshLocalizer:
@@ -81,8 +66,9 @@ class MeshLocalizer:
 
     def reset(self) -> None:
         """Forget all that was measured, keep the map: as after construction."""
-        self._odometry = OdometryTrack(self.config.motion)
-        self._anchors: list[_Anchor] = []
+        self._poses = PoseTrack(self.config.motion)
+        self._draft = self._poses
+        """What a correction works at; `pose_at` and `predict` go on with the other one until it is adopted."""
         self._hypotheses = HypothesisSet(self.surface, self.config)
         self._recovering = True
         self._everywhere = True
@@ -91,7 +77,6 @@ class MeshLocalizer:
         self._poor = 0
         self._last_search: int | None = None
         self._last_scan: int | None = None
-        self._latest = Localization(0, np.eye(4), UNKNOWN, Status.LOST)
         self._observed = 6
 
     @cached_property
@@ -116,60 +101,81 @@ class MeshLocalizer:
             raise InvalidValueError("T_map_base", np.asarray(T_map_base).tolist(), "a finite rigid 4x4 transform")
         if covariance is None:
             covariance = start_covariance(self.config.initial_sigma, self.config.initial_sigma_yaw)
-        self._anchors = []
-        self._anchor(stamp, np.array(T_map_base, dtype=float), covariance)
+        T_map_base = np.array(T_map_base, dtype=float)
+        self._poses.anchors = []
+        self._poses.anchor(stamp, T_map_base, covariance)
         self._hypotheses.items = []
         self._recovering, self._everywhere = False, False
         c = self.config
         sigma, sigma_yaw = np.sqrt(max(covariance[0, 0], covariance[1, 1])), np.sqrt(covariance[5, 5])
         self._trusted = bool(sigma <= c.trusted_sigma and sigma_yaw <= c.trusted_sigma_yaw)
         self._poor, self._level, self._last_search = 0, 0.0, None
-        self._latest = Localization(stamp, self._anchors[-1].T_map_base, covariance, Status.DEGRADED)
+        self._poses.latest = Localization(stamp, T_map_base, covariance, Status.DEGRADED)
 
     def predict(self, odometry: Odometry) -> None:
         """Take one odometry reading; malformed and stale ones are ignored."""
-        self._odometry.add(odometry)
+        self._poses.odometry.add(odometry)
 
     def update(self, scan: LidarScan) -> Localization:
         """Correct with one scan; the result is stamped with the scan's last shot."""
-        end = scan_end(scan)
-        if self._latest.stamp and end <= self._latest.stamp and self._anchors:
+        found = self.begin(scan)()
+        self.adopt()
+        return found
+
+    def begin(self, scan: LidarScan) -> Callable[[], Localization]:
+        """The work of `update`, which may be done in another thread.
+
+        Until it is done and adopted, poses are those of before, and only `predict` and `pose_at` may be called.
+        """
+        self._draft = self._poses.copy()
+        return partial(self._correct, scan)
+
+    def adopt(self) -> None:
+        """Take over what the work begun last has found."""
+        self._poses.adopt(self._draft)
+
+    def _correct(self, scan: LidarScan) -> Localization:
+        end, draft = scan_end(scan), self._draft
+        if draft.latest.stamp and end <= draft.latest.stamp and draft.anchors:
             return self._restated(end, Status.STALE)
         c = self.config
         mask = self._lidar_mask(scan) if self._lidar_mask is not None else None
         sigma = c.registration.range_sigma
-        measurement = deskew(scan, self._odometry, sigma, c.min_range, c.max_range, mask)
+        measurement = deskew(scan, draft.odometry, sigma, c.min_range, c.max_range, mask)
         if len(measurement) < c.registration.min_correspondences:
             return self._restated(end, Status.NO_DATA)
         self._last_scan = end
-        self._latest = self._recover(measurement) if self._recovering else self._track(measurement, scan.stamp)
-        return self._latest
+        draft.latest = self._recover(measurement) if self._recovering else self._track(measurement, scan.stamp)
+        return draft.latest
 
     def update_depth(self, frame: RgbdFrame) -> Localization:
         """Correct with a depth image where the lidar is silent or leaves directions open; else just `pose_at`."""
-        late = bool(self._anchors) and frame.stamp <= self._anchors[-1].stamp
+        anchors = self._poses.anchors
+        late = bool(anchors) and frame.stamp <= anchors[-1].stamp
         silent = self._last_scan is None or frame.stamp - self._last_scan > 0.25 * NANOSECONDS
         if self._recovering or late or not (silent or self._observed < 6):
             return self.pose_at(frame.stamp)
         mask = self._depth_mask(frame) if self._depth_mask is not None else None
         shots = depth_measurement(frame, self.config.depth_stride, self.config.depth_max_range, mask)
-        T, P = self._predicted(frame.stamp)
+        self._draft = self._poses.copy()
+        T, P = self._draft.at(frame.stamp)
         found = register(shots, self.surface, T, P, self.config.registration, strides=(2, 1), assessed=True)
         share = (found.assessment or UNJUDGED).explained
         if not found.converged or share < self.config.recovery.min_share or self._contradicts(found, T, P):
             return self._restated(frame.stamp, Status.NO_DATA)
-        self._anchor(frame.stamp, found.T_map_base, found.covariance)
-        self._latest = Localization(
+        self._draft.anchor(frame.stamp, found.T_map_base, found.covariance)
+        self._draft.latest = Localization(
             frame.stamp, found.T_map_base, found.covariance, Status.DEGRADED, share, found.residual
         )
-        return self._latest
+        self.adopt()
+        return self._poses.latest
 
     # -------------------------------------------------------------------------------------------------------- asking
 
     def pose_at(self, stamp: int) -> Localization:
         """Best pose at `stamp`: between corrections the drift is spread evenly, beyond the last odometry leads on."""
-        T, P = self._predicted(stamp)
-        last = self._latest
+        T, P = self._poses.at(stamp)
+        last = self._poses.latest
         return Localization(stamp, T, P, last.status, last.inlier_share, last.residual)
 
     @property
@@ -183,8 +189,8 @@ class MeshLocalizer:
         """One step of the filter; the odometry's error over the scan leaves about half of itself in the shots."""
         if not self._trusted:
             return self._look_around(measurement)
-        T, P = self._predicted(measurement.stamp)
-        skew = 0.25 * self._odometry.noise(scan_start, measurement.stamp)
+        T, P = self._draft.at(measurement.stamp)
+        skew = 0.25 * self._draft.odometry.noise(scan_start, measurement.stamp)
         turned = rotate_covariance(T[:3, :3], skew)
         found = register(measurement, self.surface, T, P, self.config.registration, systematic=turned, assessed=True)
         judged = found.assessment or UNJUDGED
@@ -203,10 +209,10 @@ class MeshLocalizer:
             self._hypotheses.add(np.stack([found.T_map_base, T]), measurement, travel, incumbent=True)
             return self._recover(measurement)
         if poor:
-            self._anchor(measurement.stamp, T, P)
+            self._draft.anchor(measurement.stamp, T, P)
             return Localization(measurement.stamp, T, P, Status.DEGRADED, judged.explained, found.residual)
         self._level += 0.03 * (judged.structure - self._level)
-        self._anchor(measurement.stamp, found.T_map_base, found.covariance)
+        self._draft.anchor(measurement.stamp, found.T_map_base, found.covariance)
         vague = float(np.sqrt(np.linalg.eigvalsh(found.covariance[:2, :2])[-1])) > 0.1
         status = Status.DEGRADED if vague or not found.converged else Status.OK
         return Localization(
@@ -224,7 +230,7 @@ class MeshLocalizer:
     def _look_around(self, measurement: Measurement) -> Localization:
         """First scan after a given start: a search in a window around it, and the start itself."""
         c = self.config
-        T, P = self._predicted(measurement.stamp)
+        T, P = self._draft.at(measurement.stamp)
         half = max(c.recovery.window, 3.0 * float(np.sqrt(max(P[0, 0], P[1, 1]))))
         half_yaw = min(max(c.recovery.window_yaw, 3.0 * float(np.sqrt(P[5, 5]))), np.pi)
         around = search(measurement, self.search_map, c.search, window=(T, half, half_yaw))
@@ -240,7 +246,7 @@ class MeshLocalizer:
         """Weigh the hypotheses with one scan; search for more now and then; believe one when it stands out."""
         c, stamp = self.config.recovery, measurement.stamp
         travel = self._travel(stamp)
-        self._hypotheses.carry(self._odometry, stamp)
+        self._hypotheses.carry(self._draft.odometry, stamp)
         due = self._last_search is None or stamp - self._last_search >= c.search_period * NANOSECONDS
         if self._everywhere and due:
             self._last_search = stamp
@@ -253,16 +259,16 @@ class MeshLocalizer:
             best = items[0] if items else None
             if best is None or (len(best.shares) >= c.accept_scans and best.share < c.accept_share):
                 self._everywhere = True
-            T = best.T_map_base if best else self._predicted(stamp)[0]
+            T = best.T_map_base if best else self._draft.at(stamp)[0]
             lost = best is None or best.share < c.min_share
             share = best.assessment.explained if best else 0.0
-            self._anchors = []
-            self._anchor(stamp, T, UNKNOWN)
+            self._draft.anchors = []
+            self._draft.anchor(stamp, T, UNKNOWN)
             return Localization(stamp, T, UNKNOWN, Status.LOST if lost else Status.AMBIGUOUS, share)
         self._recovering, self._everywhere, self._trusted, self._poor = False, False, True, 0
         self._level = winner.share
-        self._anchors = []
-        self._anchor(stamp, winner.T_map_base, winner.covariance)
+        self._draft.anchors = []
+        self._draft.anchor(stamp, winner.T_map_base, winner.covariance)
         return Localization(
             stamp, winner.T_map_base, winner.covariance, Status.OK, winner.assessment.explained, winner.residual
         )
@@ -270,31 +276,10 @@ class MeshLocalizer:
     # -------------------------------------------------------------------------------------------------------- poses
 
     def _travel(self, stamp: int) -> float:
-        distance, rotation = self._odometry.travel(stamp)
+        distance, rotation = self._draft.odometry.travel(stamp)
         return distance + 0.5 * rotation
-
-    def _anchor(self, stamp: int, T_map_base: Float64, covariance: Float64) -> None:
-        T_map_odom = T_map_base @ inverse(self._odometry.pose(stamp))
-        self._anchors.append(_Anchor(stamp, T_map_base, covariance, T_map_odom))
-        oldest = stamp - self.config.motion.horizon * NANOSECONDS
-        while self._anchors[0].stamp < oldest:
-            del self._anchors[0]
-
-    def _predicted(self, stamp: int) -> tuple[Float64, Float64]:
-        """(4, 4) T_map_base and (6, 6) covariance at any stamp."""
-        if not self._anchors:
-            return self._odometry.pose(stamp), UNKNOWN
-        k = bisect_right([anchor.stamp for anchor in self._anchors], stamp)
-        if 0 < k < len(self._anchors):
-            a, b = self._anchors[k - 1], self._anchors[k]
-            share = (stamp - a.stamp) / (b.stamp - a.stamp)
-            T = interpolate(a.T_map_odom, b.T_map_odom, share) @ self._odometry.pose(stamp)
-            return T, (1.0 - share) * a.covariance + share * b.covariance
-        anchor = self._anchors[max(k - 1, 0)]
-        motion = self._odometry.relative(anchor.stamp, stamp)
-        return propagate(anchor.T_map_base, anchor.covariance, motion, self._odometry.noise(anchor.stamp, stamp))
 
     def _restated(self, stamp: int, status: Status) -> Localization:
         """The predicted pose, with why nothing new was learnt."""
-        T, P = self._predicted(stamp)
-        return Localization(stamp, T, P, status, self._latest.inlier_share, self._latest.residual)
+        T, P = self._draft.at(stamp)
+        return Localization(stamp, T, P, status, self._draft.latest.inlier_share, self._draft.latest.residual)

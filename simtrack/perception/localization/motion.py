@@ -29,6 +29,13 @@ class OdometryTrack:
     def __len__(self) -> int:
         return len(self._stamps)
 
+    def copy(self) -> "OdometryTrack":
+        """The readings so far; those that are added to either one do not reach the other."""
+        other = OdometryTrack(self._config)
+        other._stamps, other._poses, other._travel = list(self._stamps), list(self._poses), list(self._travel)
+        other._twist = self._twist
+        return other
+
     @property
     def last_stamp(self) -> int | None:
         """Nanoseconds of the newest reading, None before the first."""

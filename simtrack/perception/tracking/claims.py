@@ -1,22 +1,22 @@
 """Detections that need a registration of their own: of a new object, or of a known one that they see otherwise.
 
-Such a registration tries many starts and takes longer than a frame lasts. It is done beside the frames, one at a time,
-and its answer is used a fixed time of the sensor's clock later: what the tracker does never depends on how fast the
-machine is, and where it is fast enough, no frame waits.
+Such a registration tries many starts and takes longer than a frame lasts. It is done beside the frames
+(`simtrack.perception.beside`); answers are taken up in the order of the claims, one a frame.
 """
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
-import numba as nb
 import numpy as np
 
-from simtrack.contracts import NANOSECONDS, Float64, PoseHypothesis
+from simtrack.contracts import Float64, PoseHypothesis
+from simtrack.perception.beside import Beside, worker
 from simtrack.perception.tracking.birth import Occluders, Prober
-from simtrack.perception.tracking.registration import RegistrationResult, TrackedModel
-from simtrack.perception.tracking.target import Target, View
+from simtrack.perception.tracking.follow_up import Candidate
+from simtrack.perception.tracking.registration import TrackedModel
+from simtrack.perception.tracking.target import Target, TrackerConfig, View
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,20 +42,23 @@ class Claim:
         return T[:3, 3]
 
 
-class ClaimQueue:
-    """Claims in the order of their detections; the first one is worked at in a thread of its own."""
+AT_WORK = 4
+"""Claims that are handed to the thread at most; it works at one after the other."""
 
-    def __init__(self, prober: Prober, models: Mapping[str, TrackedModel], seconds: float) -> None:
-        """`prober` belongs to the thread while a claim is worked at; answers are used after `seconds`."""
-        self._prober, self._models = prober, models
-        self._period = round(seconds * NANOSECONDS)
+
+class ClaimQueue:
+    """Claims in the order of their detections; the first ones are worked at in a thread of its own."""
+
+    def __init__(self, prober: Prober, models: Mapping[str, TrackedModel], config: TrackerConfig) -> None:
+        """`prober` belongs to the thread from now on."""
+        self._prober, self._models, self._config = prober, models, config
         self._waiting: deque[Claim] = deque()
-        self._current: tuple[Claim, int, Future[RegistrationResult | None]] | None = None
-        self._executor: ThreadPoolExecutor | None = None
+        self._working: deque[tuple[Claim, Beside[Candidate | None]]] = deque()
+        self._thread = worker("claims")
 
     def add(self, claim: Claim) -> None:
         """Queue a claim. It takes the turn of an older one about the same thing, or is dropped if that is at work."""
-        if self._current is not None and self._same(claim, self._current[0]):
+        if any(self._same(claim, other) for other, _ in self._working):
             return
         for k, other in enumerate(self._waiting):
             if self._same(claim, other):
@@ -63,34 +66,45 @@ class ClaimQueue:
                 return
         self._waiting.append(claim)
 
-    def settle(self, stamp: int) -> tuple[Claim, RegistrationResult | None] | None:
-        """The claim at work and the fit that was found, once its time is up at `stamp`; waits for it if need be."""
-        if self._current is None or stamp - self._current[1] < self._period:
+    def settle(self, stamp: int) -> tuple[Claim, Candidate | None] | None:
+        """The first claim at work and what was found, once its time is up at `stamp`; waits if need be."""
+        if not self._working or not self._working[0][1].due(stamp):
             return None
-        claim, _, answer = self._current
-        self._current = None
-        return claim, answer.result()
+        claim, beside = self._working.popleft()
+        return claim, beside.settle()
 
-    def work(self, stamp: int, oldest: int, occluders: Callable[[Claim], Occluders]) -> None:
-        """Begin with the next claim whose image is not older than `oldest`, if none is at work."""
-        while self._current is None and self._waiting:
+    def work(self, stamp: int, oldest: int, views: Callable[[Claim], list[tuple[View, Occluders]]]) -> None:
+        """Begin with the next claims, as far as there is room.
+
+        Args:
+            stamp: now, nanoseconds.
+            oldest: claims whose images are older are dropped, nanoseconds.
+            views: a claim's image and all later ones, with what is believed to stand around in each.
+        """
+        while self._waiting and len(self._working) < AT_WORK:
             claim = self._waiting.popleft()
             if claim.view.stamp < oldest or (claim.target is not None and not claim.target.alive):
                 continue
-            if self._executor is None:
-                threads = nb.get_num_threads()  # of the calling thread; new threads have a number of their own
-                self._executor = ThreadPoolExecutor(1, "simtrack-claims", nb.set_num_threads, (threads,))
-            view, model = claim.view, self._models[claim.class_name]
-            arguments = claim.group, model, view.depth, view.intrinsics, occluders(claim)
-            self._current = claim, stamp, self._executor.submit(self._prober.best, *arguments)
+            beside = Beside[Candidate | None](self._thread, self._config.claim_time)
+            beside.begin(stamp, partial(self._candidate, claim, views(claim)))
+            self._working.append((claim, beside))
+
+    def _candidate(self, claim: Claim, views: list[tuple[View, Occluders]]) -> Candidate | None:
+        """Register a claim to its own image, and follow what is found through the later ones."""
+        (view, around), later = views[0], views[1:]
+        model = self._models[claim.class_name]
+        fit = self._prober.best(claim.group, model, view.depth, view.intrinsics, around)
+        if fit is None:
+            return None
+        candidate = Candidate.found(model, fit, view, self._config)
+        candidate.follow(self._prober, later, self._config)
+        return candidate
 
     def close(self) -> None:
         """End the thread, when it is done with its claim."""
         self._waiting.clear()
-        self._current = None
-        if self._executor is not None:
-            self._executor.shutdown()
-            self._executor = None
+        self._working.clear()
+        self._thread.shutdown(cancel_futures=True)
 
     def _same(self, a: Claim, b: Claim) -> bool:
         if a.target is not None and b.target is not None:

@@ -83,6 +83,21 @@ class ModelImages(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def _only_readings(depth, out):
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            d = np.float32(depth[v, u])
+            out[v, u] = d if np.float32(0.0) < d < np.inf else np.float32(0.0)
+
+
+def usable_depth(depth: Float32) -> Float32:
+    """(H, W) copy of a depth image in which whatever is no finite, positive reading is 0."""
+    out = np.empty(depth.shape, np.float32)
+    _only_readings(depth, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
 def axial_variance(z: float, cosine: float, pixel_noise: float) -> float:
     """Variance of a structured-light depth reading, m^2.
 
@@ -150,6 +165,43 @@ def erase(pixels, images):
     instance = images.instance.reshape(-1)
     for i in range(pixels.shape[0]):
         instance[pixels[i]] = UNKNOWN_PIXEL
+
+
+@njit(cache=True, nogil=True)
+def mark_around(pixels, rows, strides, fine, marks):
+    """Mark the pixels that a finer cast may hit, and their neighbours, by what a coarser one hit.
+
+    `rows` (N,) as for `point_correspondences`; `strides` and `fine` (K,), the pixel grids of each instance in this cast
+    and in the finer one. Output: `marks` (H, W), True on the finer grid around each hit.
+    """
+    height, width = marks.shape
+    for i in range(pixels.shape[0]):
+        k = rows[i]
+        if k < 0 or k >= strides.shape[0]:
+            continue
+        v, u, f = pixels[i] // width, pixels[i] % width, fine[k]
+        reach = strides[k] + 2 * f + 2  # up to the next ray that missed, the silhouette's surroundings, a motion
+        low = (max(u - reach, 0) + f - 1) // f * f
+        for y in range((max(v - reach, 0) + f - 1) // f * f, min(v + reach + 1, height), f):
+            for x in range(low, min(u + reach + 1, width), f):
+                marks[y, x] = True
+
+
+@njit(cache=True, nogil=True)
+def take_marked(marks):
+    """Flat indices of the marked pixels, ascending; nothing is marked afterwards."""
+    flat = marks.reshape(-1)
+    count = 0
+    for i in range(flat.shape[0]):
+        count += flat[i]
+    pixels = np.empty(count, np.int32)
+    found = 0
+    for i in range(flat.shape[0]):
+        if flat[i]:
+            pixels[found] = i
+            found += 1
+            flat[i] = False
+    return pixels
 
 
 @njit(cache=True, nogil=True)

@@ -25,7 +25,7 @@ from simtrack.contracts import (
 )
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import apply
-from simtrack.perception.tracking.correspondences import axial_variance
+from simtrack.perception.tracking.correspondences import axial_variance, usable_depth
 from simtrack.raycast import RayBundle, RayScene
 from simtrack.raycast.kernels import run
 
@@ -82,8 +82,7 @@ def presegment_camera(
 
     """
     config = config or PresegmentationConfig()
-    depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0.0), frame.depth, np.float32(0.0)).astype(np.float32)
-    near = depth <= config.max_range
+    depth = usable_depth(frame.depth)
     valid = int(np.count_nonzero(depth))
     if valid == 0:
         empty = np.zeros(depth.shape, bool)
@@ -99,11 +98,11 @@ def presegment_camera(
         depth, hits.distances.reshape(bundle.shape), normals.reshape(*bundle.shape, 3), camera, config.stride,
         config.map_sigma, config.tolerance, config.focal_baseline, unknown, doubtful,
     )  # fmt: skip
-    unknown &= near
-    doubtful &= near
+    explained = depth > config.max_range
     if own_body is not None:
-        unknown &= ~own_body
-        doubtful &= ~own_body
+        explained |= own_body
+    unknown[explained] = False
+    doubtful[explained] = False
     labels, count = _label_pixels(unknown, depth, config.join, config.min_pixels)
     _grow(labels, doubtful, depth, config.join, config.growth)
     regions = _camera_regions(labels, count, depth, K, T_map_camera, frame.stamp)
@@ -157,12 +156,22 @@ def presegment_lidar(
 
 def shot_rays(scan: LidarScan, pose_at: Callable[[int], Float64]) -> tuple[Float32, Float32]:
     """Origins and unit directions (N, 3) of a scan's shots in the map, each from the sensor's pose at its own time."""
-    last = float(scan.times.max()) if len(scan.times) else 0.0
-    knots = np.linspace(0.0, max(last, 1e-6), 5)
-    poses = np.stack([pose_at(scan.stamp + int(t * 1e9)) @ scan.T_base_lidar for t in knots])
+    knots = _knots(scan)
+    poses = np.stack([pose_at(stamp) @ scan.T_base_lidar for stamp in shot_stamps(scan)])
     origins, directions = np.empty(scan.directions.shape, np.float32), np.empty(scan.directions.shape, np.float32)
     _shoot(scan.directions, scan.times, knots[1], poses, origins, directions)
     return origins, directions
+
+
+def shot_stamps(scan: LidarScan) -> list[int]:
+    """Nanoseconds at which `shot_rays` asks for the pose of the base."""
+    return [scan.stamp + int(t * 1e9) for t in _knots(scan)]
+
+
+def _knots(scan: LidarScan) -> Float64:
+    """Seconds after the scan's stamp between which its motion is taken to be even."""
+    last = float(scan.times.max()) if len(scan.times) else 0.0
+    return np.linspace(0.0, max(last, 1e-6), 5)
 
 
 @njit(cache=True, nogil=True)
@@ -184,45 +193,62 @@ def _shoot(shots, times, period, poses, origins, directions):
             directions[i, a] /= np.sqrt(length)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distances(x, y, d, z, ray_x, ray_y, normal):
+    """How far a point is from the tangent plane of a model point at depth z on a ray, and from that point, squared."""
+    ex, ey, ez = x - z * ray_x, y - z * ray_y, d - z
+    return abs(ex * normal[0] + ey * normal[1] + ez * normal[2]), ex * ex + ey * ey + ez * ez
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _unexplained_in_row(
     v, depth, model_depth, normals, camera, stride, map_sigma, tolerance, focal_baseline, unknown, doubtful
 ):  # fmt: skip
-    width = depth.shape[1]
+    width, row = depth.shape[1], v // stride
     rows, columns = model_depth.shape
-    for u in range(width):
-        d = depth[v, u]
-        if d <= 0.0:
-            continue
-        x, y = d * (u - camera[2]) / camera[0], d * (v - camera[3]) / camera[1]
-        variance = axial_variance(d, 0.9, focal_baseline)
-        sigma = np.sqrt(variance)
-        limit = min(3.0 * np.sqrt(variance + map_sigma * map_sigma), 2.5 * sigma + tolerance)
-        lateral = 2.0 * stride * d / camera[0] + 0.5 * limit
-        row, column = v // stride, u // stride
-        doubt = min(limit, sigma + 0.5 * tolerance)
-        nearest = 1e9
-        for ring in range(3):  # the pixel's own ray first: it explains nearly all
-            for b in range(-ring, ring + 1):
-                for a in range(-ring, ring + 1):
-                    if nearest < doubt or max(abs(a), abs(b)) != ring:
-                        continue
-                    i, j = row + b, column + a
-                    if i < 0 or j < 0 or i >= rows or j >= columns:
-                        continue
-                    z = model_depth[i, j]
-                    if not z < 1e6:
-                        continue
-                    ex = x - z * (j * stride - camera[2]) / camera[0]
-                    ey = y - z * (i * stride - camera[3]) / camera[1]
-                    ez = d - z
-                    off = abs(ex * normals[i, j, 0] + ey * normals[i, j, 1] + ez * normals[i, j, 2])
-                    if off < limit and ex * ex + ey * ey + ez * ez < lateral * lateral + 25.0 * off * off:
-                        nearest = min(nearest, off)
-            if nearest < doubt:
-                break
-        unknown[v, u] = nearest >= limit
-        doubtful[v, u] = nearest >= doubt
+    ray_y, row_y = (v - camera[3]) / camera[1], (row * stride - camera[3]) / camera[1]
+    # What is this near to its own ray's plane is explained at any distance: the sensor is best at 0.4 m.
+    least = axial_variance(0.4, 0.9, 1e9)
+    surely = min(3.0 * np.sqrt(least + map_sigma * map_sigma), np.sqrt(least) + 0.5 * tolerance)
+    for column in range(columns):
+        own = model_depth[row, column]
+        own_x = (column * stride - camera[2]) / camera[0]
+        for u in range(column * stride, min((column + 1) * stride, width)):
+            d = float(depth[v, u])
+            if d <= 0.0:
+                continue
+            x, y = d * (u - camera[2]) / camera[0], d * ray_y
+            off, square, beside = 1e9, 0.0, 2.0 * stride * d / camera[0]
+            if own < 1e6:
+                off, square = _distances(x, y, d, own, own_x, row_y, normals[row, column])
+                if off < surely and square < beside * beside + 25.0 * off * off:
+                    continue
+            variance = axial_variance(d, 0.9, focal_baseline)
+            sigma = np.sqrt(variance)
+            limit = min(3.0 * np.sqrt(variance + map_sigma * map_sigma), 2.5 * sigma + tolerance)
+            lateral = beside + 0.5 * limit
+            doubt = min(limit, sigma + 0.5 * tolerance)
+            nearest = 1e9
+            if off < limit and square < lateral * lateral + 25.0 * off * off:
+                nearest = off
+                if off < doubt:
+                    continue
+            for ring in range(1, 3):
+                for i in range(max(row - ring, 0), min(row + ring + 1, rows)):
+                    for j in range(max(column - ring, 0), min(column + ring + 1, columns)):
+                        if nearest < doubt or max(abs(i - row), abs(j - column)) != ring:
+                            continue
+                        z = model_depth[i, j]
+                        if not z < 1e6:
+                            continue
+                        other_x, other_y = (j * stride - camera[2]) / camera[0], (i * stride - camera[3]) / camera[1]
+                        off, square = _distances(x, y, d, z, other_x, other_y, normals[i, j])
+                        if off < limit and square < lateral * lateral + 25.0 * off * off:
+                            nearest = min(nearest, off)
+                if nearest < doubt:
+                    break
+            unknown[v, u] = nearest >= limit
+            doubtful[v, u] = nearest >= doubt
 
 
 @njit(cache=True, nogil=True)
@@ -257,14 +283,14 @@ def _label_pixels(unknown, depth, join, min_pixels):
     labels = np.zeros((height, width), np.int32)
     stack = np.empty(height * width, np.int32)
     count = 0
+    pixels, owners = unknown.reshape(-1), labels.reshape(-1)
     for start in range(height * width):
-        v0, u0 = start // width, start % width
-        if not unknown[v0, u0] or labels[v0, u0] != 0:
+        if not pixels[start] or owners[start] != 0:
             continue
         count += 1
         size, top, seen = 1, 1, 0
         stack[0] = start
-        labels[v0, u0] = count
+        owners[start] = count
         # The stack doubles as the list of members: it is never overwritten before `seen`.
         while seen < top:
             pixel = stack[seen]
@@ -283,11 +309,10 @@ def _label_pixels(unknown, depth, join, min_pixels):
                         size += 1
         if size < min_pixels:
             for i in range(top):
-                labels[stack[i] // width, stack[i] % width] = -1
+                owners[stack[i]] = -1
             count -= 1
-    for v in range(height):
-        for u in range(width):
-            labels[v, u] = max(labels[v, u], 0)
+    for i in range(height * width):
+        owners[i] = max(owners[i], 0)
     return labels, count
 
 
@@ -323,8 +348,9 @@ def _grow(labels, doubtful, depth, join, steps):
 def _camera_regions(
     labels: Int32, count: int, depth: Float32, K: CameraIntrinsics, T_map_camera: Float64, stamp: int
 ) -> tuple[RegionOfInterest, ...]:
-    rows, columns = np.nonzero(labels)
-    owner = labels[rows, columns]
+    pixels = np.flatnonzero(labels.ravel() != 0)
+    rows, columns = np.divmod(pixels, labels.shape[1])
+    owner = labels.ravel()[pixels]
     order = np.argsort(owner, kind="stable")
     starts = np.searchsorted(owner[order], np.arange(1, count + 2))
     regions = []

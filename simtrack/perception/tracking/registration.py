@@ -78,6 +78,8 @@ class Registration:
         self._scene = RayScene()
         self._models: dict[int, TrackedModel] = {}
         self._images = kernels.ModelImages.empty(0, 0)
+        self._marks = np.zeros((0, 0), bool)
+        """(H, W), where the casts of a track have hit something, or nearly: a fine one needs no other rays."""
         self._points, self._edges = kernels.Points.room(0), kernels.Edges.room(0)
 
     def add(self, instance: int, model: TrackedModel) -> None:
@@ -131,6 +133,7 @@ class Registration:
         if batch is None:
             return {}
         predicted = batch.poses.copy()
+        self._marks[:] = False
         self._follow(batch, (config.near,), np.ones(len(batch.instances), bool))
         far = ~batch.near(predicted, config)
         if far.any():
@@ -213,12 +216,16 @@ class Registration:
         self._scene.set_poses(list(shown), list(shown.values()))
         if self._images.depth.shape != depth.shape:
             self._images = kernels.ModelImages.empty(*depth.shape)
+            self._marks = np.zeros(depth.shape, bool)
         return batch if batch.instances else None
 
-    def _cast(self, batch: "_Batch", strides: npt.NDArray[np.int64]) -> tuple[RayBundle, RayHits]:
-        """Cast the rays of the active instances' windows, on pixel grids (K,)."""
+    def _cast(self, batch: "_Batch", strides: npt.NDArray[np.int64], marked: bool = False) -> tuple[RayBundle, RayHits]:
+        """Cast the rays of the active instances' windows, on pixel grids (K,), or those that are marked."""
         windows, grids = batch.windows[batch.active], strides[batch.active]
-        bundle = RayBundle.from_windows(batch.intrinsics, windows.tolist(), grids.tolist())
+        if marked:
+            bundle = RayBundle.from_pixels(batch.intrinsics, kernels.take_marked(self._marks))
+        else:
+            bundle = RayBundle.from_windows(batch.intrinsics, windows.tolist(), grids.tolist())
         # Rays a few pixels apart meet other triangles of a fine mesh: they are no coherent packets.
         hits = self._scene.cast(bundle, np.eye(4), coherent=None if (grids == 1).all() else False)
         if len(bundle) > len(self._points.weight):
@@ -230,7 +237,7 @@ class Registration:
         config, count = self.config, len(batch.instances)
         batch.locate()
         strides = batch.fine_strides if step.fine else step.coarsen * batch.strides
-        bundle, hits = self._cast(batch, strides)
+        bundle, hits = self._cast(batch, strides, marked=step.fine)
         pixels = bundle.pixels
         assert pixels is not None
         # Occluders that are not registered keep their rays: they are neither misses nor rows.
@@ -238,6 +245,8 @@ class Registration:
         row[batch.instances] = np.where(batch.active, np.arange(count), count)
         rows = np.empty(len(bundle), np.int32)
         kernels.rows_of(hits.instances, row, rows)
+        if not step.fine:
+            kernels.mark_around(pixels, rows, strides, batch.fine_strides, self._marks)
         batch.counts[batch.active], batch.edges[batch.active] = 0, 0
         pairs = kernels.point_correspondences(
             pixels, bundle.directions, hits.distances, hits.normals, rows, batch.depth.reshape(-1),

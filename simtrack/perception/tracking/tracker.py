@@ -32,9 +32,11 @@ from simtrack.perception.tracking.association import (
     nearest_equivalent,
     rotation_apart,
 )
-from simtrack.perception.tracking.birth import Occluders, Prober, believable, cost
+from simtrack.perception.tracking.birth import Occluders, Prober, cost
 from simtrack.perception.tracking.claims import Claim, ClaimQueue
+from simtrack.perception.tracking.correspondences import usable_depth
 from simtrack.perception.tracking.filter import Measurement, PoseFilter
+from simtrack.perception.tracking.follow_up import Candidate, measurement
 from simtrack.perception.tracking.registration import Registration, RegistrationResult
 from simtrack.perception.tracking.target import (
     Target,
@@ -62,7 +64,8 @@ class ObjectTracker:
         self._tracked = {name: tracked_model(model) for name, model in self._models.items()}
         self._registration = Registration(self.config.registration)
         self._prober = Prober(self.config.registration, self.config.fit)
-        self._claims = ClaimQueue(self._prober, self._tracked, self.config.claim_time)
+        self._claimant = Prober(self.config.registration, self.config.fit)
+        self._claims = ClaimQueue(self._claimant, self._tracked, self.config)
         self._targets: list[Target] = []
         self._next_id = 1
         self._views: deque[View] = deque()
@@ -72,6 +75,7 @@ class ObjectTracker:
         self._claims.close()
         self._registration.close()
         self._prober.close()
+        self._claimant.close()
 
     # ------------------------------------------------------------------------------------------------------- the frame
 
@@ -99,25 +103,24 @@ class ObjectTracker:
                 raise UnknownNameError("object class", h.class_name, self._models)
         if self._views and frame.stamp <= self._views[-1].stamp:
             return TrackerResult(frame.stamp, self._tracks(self._views[-1]), Status.STALE)
-        depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0.0), frame.depth, np.float32(0.0))
-        view = View(frame.stamp, depth.astype(np.float32), frame.intrinsics, T_map_camera, covariance)
+        view = View(frame.stamp, usable_depth(frame.depth), frame.intrinsics, T_map_camera, covariance)
         self._views.append(view)
         while view.stamp - self._views[0].stamp > self.config.buffer * NANOSECONDS:
             self._views.popleft()
-        status = Status.OK if np.any(depth) else Status.NO_DATA
-        self._register(view)
+        status = Status.OK if np.any(view.depth) else Status.NO_DATA
+        self._register(view, status)
         self._take_detections(hypotheses)
         self._settle_claims(view.stamp)
         self._prune(view.stamp)
         return TrackerResult(frame.stamp, self._tracks(view), status)
 
-    def _register(self, view: View) -> None:
+    def _register(self, view: View, status: Status) -> None:
         """Register all living targets to a view and judge each."""
         T_camera_map = inverse(view.T_map_camera)
         living = [t for t in self._targets if t.alive]
         poses = {t.id: T_camera_map @ t.filter.predict(view.stamp).T_map_object for t in living}
         results = {}
-        if np.any(view.depth):
+        if status is not Status.NO_DATA:
             results = self._registration.track(view.depth, view.intrinsics, poses)
         for target in living:
             self._judge(target, view, poses[target.id], results.get(target.id))
@@ -160,16 +163,16 @@ class ObjectTracker:
         if gap and target.known and jump > self.config.displaced and target.vague(self.config):
             # It was moved while nobody looked, and its surface alone does not tell how: detections have to.
             self._demote(target, view.stamp)
-        measurement = self._measurement(view, result, target.last_seen)
+        taken = measurement(view, result, target.last_seen, self.config)
         poor = result.misfit > self.config.poor_misfit
-        if target.known and (poor or self._incredible(target, measurement)):
+        if target.known and (poor or self._incredible(target, taken)):
             target.filter.skip(view.stamp)
             target.doubts += 1
             if target.doubts >= self.config.doubt_after and target.status is not TrackStatus.TENTATIVE:
                 self._demote(target, view.stamp)
             return
         target.doubts = 0
-        target.filter.update(measurement)
+        target.filter.update(taken)
         target.frames += 1
         target.last_seen = view.stamp
         target.missing_since = None
@@ -203,16 +206,6 @@ class ObjectTracker:
         """End the belief in a track until detections bear it out."""
         target.status, target.born = TrackStatus.TENTATIVE, stamp
         target.detections, target.frames, target.disagreements, target.doubts = 0, 0, 0, 0
-
-    def _measurement(self, view: View, result: RegistrationResult, last_seen: int) -> Measurement:
-        """A registration in the map frame; the camera's own error wanders, correlated over time."""
-        R = view.T_map_camera[:3, :3]
-        elapsed = max(view.stamp - last_seen, 0) / NANOSECONDS
-        share = 2.0 * (1.0 - np.exp(-elapsed / self.config.localization_correlation))
-        drift = share * camera_error_at(view, view.T_map_camera @ result.T_camera_object)
-        return Measurement(
-            view.stamp, view.T_map_camera @ result.T_camera_object, rotate_covariance(R, result.covariance), drift
-        )
 
     def _lose(self, target: Target) -> None:
         """Take a target out of the scene; its identity is kept for when the object turns up again."""
@@ -254,15 +247,15 @@ class ObjectTracker:
                     self._claims.add(Claim(group, view, None))
 
     def _settle_claims(self, now: int) -> None:
-        """Take the answer to the claim whose time is up, and begin with the next one."""
+        """Take the answer to the first claim whose time is up, and begin with the next ones."""
         settled = self._claims.settle(now)
         if settled is not None:
-            claim, result = settled
-            if result is not None and claim.target is None:
-                self._bear(claim, result)
-            elif result is not None:
-                self._contest(claim, result)
-        self._claims.work(now, self._views[0].stamp, lambda claim: self._around(claim.view, claim.target))
+            claim, candidate = settled
+            if candidate is not None and claim.target is None:
+                self._bear(claim, candidate)
+            elif candidate is not None:
+                self._contest(claim, candidate)
+        self._claims.work(now, self._views[0].stamp, lambda claim: self._since(claim.view.stamp, claim.target))
 
     def _confirm(self, target: Target, T_camera_object: Float64, group: list[PoseHypothesis], view: View) -> None:
         """Take a detection of a tracked object: fuse it, or let it contest an orientation that it disagrees with."""
@@ -296,7 +289,7 @@ class ObjectTracker:
                 Measurement(view.stamp, view.T_map_camera @ T, rotate_covariance(R, h.covariance), np.zeros((6, 6)))
             )
 
-    def _contest(self, claim: Claim, challenger: RegistrationResult) -> None:
+    def _contest(self, claim: Claim, challenger: Candidate) -> None:
         """Let a detection's pose and the track's compete for the better fit to the depth image of its stamp."""
         target, view = claim.target, claim.view
         if target is None or not target.alive:
@@ -306,15 +299,16 @@ class ObjectTracker:
         holder = self._prober.judge(T_camera_object, model, view.depth, view.intrinsics, around)
         # The more often detections have contradicted a pose, the better it has to fit to stay.
         margin = 1.3 / max(1.0, 0.5 * target.disagreements)
-        if holder is not None and cost(holder) < margin * cost(challenger):
+        if holder is not None and cost(holder) < margin * cost(challenger.fit):
             return
-        state = self._follow_up(target.model, challenger, view, but=target)
-        if state is not None:
+        self._catch_up(challenger, but=target)
+        if not challenger.lost:
+            state = challenger.filter
             target.filter, target.last_seen, target.disagreements = state, state.state.stamp, 0
 
-    def _bear(self, claim: Claim, result: RegistrationResult) -> None:
+    def _bear(self, claim: Claim, candidate: Candidate) -> None:
         """Make a detection that no track explains a track: a registered hypothesis of it is believable."""
-        group, view, model = claim.group, claim.view, self._models[claim.class_name]
+        group, view, model, result = claim.group, claim.view, self._models[claim.class_name], candidate.fit
         T_map_object = view.T_map_camera @ result.T_camera_object
         for other in list(self._targets):
             T_other = other.filter.pose_at(view.stamp)
@@ -334,9 +328,10 @@ class ObjectTracker:
             if not self._outdoes(result, other, T_camera_other, view):
                 return
             self._lose(other)
-        followed = self._follow_up(model, result, view)
-        if followed is None:
+        self._catch_up(candidate)
+        if candidate.lost:
             return
+        followed = candidate.filter
         target = self._known_before(model, followed) or self._newcomer(model, followed, view)
         target.filter, target.last_seen = followed, followed.state.stamp
         target.residual, target.missing_since = result.residual, None
@@ -393,28 +388,13 @@ class ObjectTracker:
         target.status, target.born, target.detections, target.frames = TrackStatus.TENTATIVE, stamp, 1, 0
         return target
 
-    def _follow_up(
-        self, model: ObjectModel, result: RegistrationResult, view: View, but: Target | None = None
-    ) -> PoseFilter | None:
-        """Replay a registered candidate through the depth images since its own; None if it is lost on the way."""
-        tracked = self._tracked[model.name]
-        R = view.T_map_camera[:3, :3]
-        covariance = rotate_covariance(R, result.covariance)
-        state = PoseFilter(view.stamp, view.T_map_camera @ result.T_camera_object, covariance, self.config.filter)
-        last = view.stamp
-        for later in self._views:
-            if later.stamp <= view.stamp:
-                continue
-            T = inverse(later.T_map_camera) @ state.predict(later.stamp).T_map_object
-            around = self._around(later, but)
-            followed = self._prober.follow(T, tracked, later.depth, later.intrinsics, around)
-            if followed is not None and believable(followed, self.config.fit):
-                state.update(self._measurement(later, followed, last))
-                last = later.stamp
-            else:
-                state.skip(later.stamp)
-        newest = self._views[-1].stamp
-        return state if newest - last <= 0.15 * NANOSECONDS else None
+    def _catch_up(self, candidate: Candidate, but: Target | None = None) -> None:
+        """Lead a candidate through the depth images that came since it was worked at."""
+        candidate.follow(self._prober, self._since(candidate.reached + 1, but), self.config)
+
+    def _since(self, stamp: int, but: Target | None) -> list[tuple[View, Occluders]]:
+        """The kept depth images from a stamp on, with the objects that are believed to stand there, but one."""
+        return [(view, self._around(view, but)) for view in self._views if view.stamp >= stamp]
 
     # ---------------------------------------------------------------------------------------------------------- results
 

@@ -1,0 +1,71 @@
+"""Work beside the frames: in a thread of its own, with an answer that is used a fixed time of the sensor's clock later.
+
+What is believed never depends on how fast the machine is or on how many threads it has: when an answer is taken up
+follows from the stamps alone. Where the machine is fast enough the answer is there by then, and no frame waits.
+"""
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Generic, TypeVar
+
+from simtrack.contracts import NANOSECONDS
+from simtrack.errors import InvalidValueError
+
+T = TypeVar("T")
+
+
+def worker(name: str) -> ThreadPoolExecutor:
+    """A thread for work beside the frames, made at first use; compiled kernels run in it on one thread each.
+
+    Kernels release the interpreter lock, so it is a second processor that does the work.
+    """
+    import numba
+
+    return ThreadPoolExecutor(1, f"simtrack-{name}", numba.set_num_threads, (1,))
+
+
+class Beside(Generic[T]):
+    """One piece of work at a time: begun at one stamp, settled at the first one that lies `seconds` later.
+
+    Several may share a thread: it does their pieces one after the other, in the order in which they were begun.
+    """
+
+    def __init__(self, thread: ThreadPoolExecutor, seconds: float) -> None:
+        if not seconds >= 0.0:
+            raise InvalidValueError("seconds", seconds, ">= 0 s")
+        self._thread, self._period = thread, round(seconds * NANOSECONDS)
+        self._work: tuple[int, Future[tuple[T, float]]] | None = None
+        self.seconds = 0.0
+        """Wall time of the piece that was settled last. Measured, not simulated."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether a piece has been begun and not been settled."""
+        return self._work is not None
+
+    def begin(self, stamp: int, work: Callable[[], T]) -> None:
+        """Begin with a piece at `stamp`, nanoseconds. What it reads must not be changed until it is settled."""
+        assert self._work is None, "the piece before it has not been settled"
+        self._work = stamp, self._thread.submit(_timed, work)
+
+    def due(self, stamp: int) -> bool:
+        """Whether there is a piece whose time is up at `stamp`, nanoseconds."""
+        return self._work is not None and stamp - self._work[0] >= self._period
+
+    def settle(self) -> T:
+        """End the piece and give its answer; waits for it if need be. Raises what the work raised."""
+        assert self._work is not None, "no piece has been begun"
+        future = self._work[1]
+        self._work = None
+        answer, self.seconds = future.result()
+        return answer
+
+    def drop(self) -> None:
+        """Forget the piece; its thread finishes it all the same."""
+        self._work = None
+
+
+def _timed(work: Callable[[], T]) -> tuple[T, float]:
+    start = time.perf_counter()
+    return work(), time.perf_counter() - start
