@@ -134,6 +134,13 @@ class RobotController:
         data.qvel[self._dof] = 0.0
         self._write(data)
 
+    def carry(self, data: "mujoco.MjData", x: float, y: float, yaw: float) -> None:
+        """Put the robot there at rest, whatever it was doing; its joints stay as they are."""
+        data.qpos[self._qpos[:3]] = x, y, yaw
+        data.qvel[self._dof[:3]] = 0.0
+        self.linear = self.angular = 0.0
+        self._write(data)
+
     def base(self, qpos: Float64) -> tuple[float, float, float]:
         """x, y, yaw of the base in the map, from a full (nq,) position vector."""
         x, y, yaw = qpos[self._qpos[:3]]
