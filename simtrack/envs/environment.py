@@ -9,6 +9,7 @@ import numpy as np
 from simtrack.contracts import Command, Float32, Uint8
 from simtrack.envs.actions import AXES, Steering
 from simtrack.envs.observations import Arrays, Encoder, Layout, encode_image, encode_robot
+from simtrack.envs.policies import Briefing
 from simtrack.envs.settings import (
     CONTROL_HZ,
     Settings,
@@ -71,7 +72,8 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
             raise InvalidValueError("argument", unknown[0], ", ".join(known))
         self.settings = Settings(observation, **arguments)
         self.task = make_task(task)
-        self.scene = fixed_building(with_objects(load_scene(scene or self.task.scene), self.settings.objects))
+        chosen = with_objects(load_scene(scene or self.task.scene), self.settings.objects)
+        self.scene = self.task.adapt(fixed_building(chosen))
         self.render_mode = self._checked(render_mode)
         camera = self.settings.camera
         seconds = self.settings.seconds or self.task.seconds
@@ -206,6 +208,12 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         return self._encoders[mode].encode(belief, snapshot.felt)
 
     # -------------------------------------------------------------------------------------------------------- the rest
+
+    def briefing(self) -> Briefing:
+        """What an agent may know before it starts: survey, robot, posture, layout; never the truth."""
+        loop = self._built()
+        simulation = loop.simulation
+        return Briefing(simulation.static_map, simulation.robot, self.steering.start, self.layout, self.settings.modes)
 
     @property
     def snapshot(self) -> "Snapshot | None":

@@ -1,7 +1,6 @@
 """The world, the robot's sensors and what is made of them, one control step at a time."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,13 +8,12 @@ from simtrack.contracts import Belief, Command, JointState, Odometry, RgbdFrame
 from simtrack.envs.observations import Proprioception
 from simtrack.envs.settings import CONTROL_NS, Settings, pixel_scale
 from simtrack.envs.truth import IdealPerception, true_belief
+from simtrack.perception.localization import MeshLocalizer
+from simtrack.perception.pipeline import PerceptionStack
 from simtrack.simulation.ground_truth import Truth
 from simtrack.simulation.oracles import OracleDetector
 from simtrack.simulation.scene_file import SceneFile
 from simtrack.simulation.simulation import Simulation
-
-if TYPE_CHECKING:
-    from simtrack.perception.pipeline import PerceptionStack
 
 BUILDING_SEED = 0
 """Decides what belongs to the building and not to an episode: the survey, and how the tracker's models are off."""
@@ -69,12 +67,13 @@ class Loop:
         self._ideal.reset()
         self._belief = self._image = None
         if self.has_stack:
-            self._end_stack()
-            self._stack = self._make_stack(seed)
+            old, self._stack = self._stack, self._make_stack(seed)
+            if old is not None:
+                if isinstance(old.localizer, MeshLocalizer) and isinstance(self._stack.localizer, MeshLocalizer):
+                    self._stack.localizer.share_search_map(old.localizer)
+                old.close()
 
-    def _make_stack(self, seed: int) -> "PerceptionStack":
-        from simtrack.perception.pipeline import PerceptionStack
-
+    def _make_stack(self, seed: int) -> PerceptionStack:
         simulation = self.simulation
         errors = self._settings.detector_config(pixel_scale(simulation.camera))
         return PerceptionStack(

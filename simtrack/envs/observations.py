@@ -17,6 +17,8 @@ from simtrack.contracts import (
     CameraIntrinsics,
     JointState,
     Localization,
+    Presegmentation,
+    RegionOfInterest,
     RgbdFrame,
     Status,
     Track,
@@ -47,7 +49,7 @@ AGE = 600.0
 """Seconds: bound of ages."""
 VARIANCE = 100.0
 """m^2 or rad^2: bound of the elements of covariances."""
-REGIONS = 8
+REGIONS = 12
 """Regions of unexplained measurements that are reported at most, the largest first."""
 STATUSES = tuple(TrackStatus)
 ANSWERS = (Status.OK, Status.AMBIGUOUS, Status.LOST)
@@ -99,6 +101,7 @@ class Layout:
             "relations": _box((n, references, len(RELATIONS)), 0, 1, np.int8),
             "unexplained": _box((1,), 0.0, 1.0),
             "regions": _box((REGIONS, 3), -PLACE, PLACE),
+            "regions_size": _box((REGIONS, 3), 0.0, PLACE),
             "regions_mask": _box((REGIONS,), 0, 1, np.int8),
             "base": _box((4,), -PLACE, PLACE),
             "base_deviation": _box((3,), 0.0, np.sqrt(VARIANCE)),
@@ -137,16 +140,19 @@ class Encoder:
         self._relation = {name: k for k, name in enumerate(RELATIONS)}
         self._furniture = {name: layout.slots + k for k, name in enumerate(layout.furniture)}
         self._unexplained = 0.0
+        self._segmented: dict[str, int] = {}
+        entries = layout.space("belief").items()
+        self._shapes = [(key, box.shape, box.dtype) for key, box in entries if isinstance(box, spaces.Box)]
 
     def reset(self) -> None:
         """Forget which slot a track has."""
         self._slots.clear()
+        self._segmented.clear()
         self._unexplained = 0.0
 
     def encode(self, belief: Belief, felt: Proprioception) -> Arrays:
         """Fresh arrays of the mode ``belief`` (or ``state``, if the belief is the truth)."""
-        layout = self.layout
-        out: Arrays = {key: np.zeros(box.shape, box.dtype) for key, box in _boxes(layout)}
+        out: Arrays = {key: np.zeros(shape, dtype) for key, shape, dtype in self._shapes}
         kept = self._assign(belief.tracks)
         for slot, track in kept:
             self._write(out, slot, track, belief.stamp)
@@ -200,16 +206,17 @@ class Encoder:
         if belief.camera is not None:
             self._unexplained = 1.0 - belief.camera.reduction
         out["unexplained"][0] = self._unexplained
-        seen = () if belief.camera is None else belief.camera.regions
-        largest = sorted(seen, key=lambda r: -r.count)[:REGIONS]
+        fresh = [seen for seen in (belief.camera, belief.lidar) if seen is not None and self._is_new(seen)]
+        largest = sorted((region for seen in fresh for region in seen.regions), key=lambda r: -r.count)[:REGIONS]
         for k, region in enumerate(largest):
             out["regions"][k] = np.clip(region.centre, -PLACE, PLACE)
+            out["regions_size"][k] = np.minimum(region.extents, PLACE)
             out["regions_mask"][k] = 1
 
-
-def _boxes(layout: Layout) -> list[tuple[str, spaces.Box]]:
-    space = layout.space("belief")
-    return [(key, box) for key, box in space.items() if isinstance(box, spaces.Box)]
+    def _is_new(self, seen: Presegmentation) -> bool:
+        """Whether this is the first step that sees a segmentation: a scan's answer stays until the next."""
+        last, self._segmented[seen.sensor] = self._segmented.get(seen.sensor), seen.stamp
+        return last != seen.stamp
 
 
 def encode_robot(felt: Proprioception, stamp: int) -> Arrays:
@@ -234,7 +241,7 @@ def encode_image(frame: RgbdFrame, layout: Layout) -> Arrays:
 def decode(arrays: Arrays, layout: Layout, robot: KinematicTree) -> tuple[Belief, JointState]:
     """The belief that an observation of the modes ``belief`` or ``state`` stands for, as agents read it.
 
-    What the arrays do not hold (images, the measurements behind a region) is empty.
+    What the arrays do not hold (images, the measurements behind a region, relations) is empty.
     """
     stamp = round(float(arrays["time"][0]) * NANOSECONDS)
     x, y, c, s = arrays["base"].astype(float)
@@ -245,11 +252,20 @@ def decode(arrays: Arrays, layout: Layout, robot: KinematicTree) -> tuple[Belief
     status = ANSWERS[answer] if answer < len(ANSWERS) else Status.NO_DATA
     joints = JointState(stamp, JOINTS, arrays["joints"].astype(float))
     T_map_camera = T_map_base @ robot.forward(dict(zip(JOINTS, joints.positions.tolist(), strict=True)))[CAMERA]
-    tracks = tuple(
-        _track(arrays, int(slot), layout, stamp, T_map_camera) for slot in np.flatnonzero(arrays["mask"])
-    )
+    tracks = tuple(_track(arrays, int(slot), layout, stamp, T_map_camera) for slot in np.flatnonzero(arrays["mask"]))
     localization = Localization(stamp, T_map_base, covariance, status)
-    return Belief(stamp, localization, T_map_camera, tracks, None, None, frozenset()), joints
+    return Belief(stamp, localization, T_map_camera, tracks, _regions(arrays, stamp), None, frozenset()), joints
+
+
+def _regions(arrays: Arrays, stamp: int) -> Presegmentation | None:
+    """The unexplained regions of one step; None if none is reported."""
+    found = np.flatnonzero(arrays["regions_mask"])
+    if not len(found):
+        return None
+    centres, sizes = arrays["regions"].astype(float), arrays["regions_size"].astype(float)
+    regions = tuple(RegionOfInterest(stamp, np.zeros(4), centres[k], sizes[k], 0, "camera") for k in found)
+    nothing = np.zeros(0, bool)
+    return Presegmentation(stamp, nothing, 0, nothing.astype(np.int32), regions, "camera")
 
 
 def _track(arrays: Arrays, slot: int, layout: Layout, stamp: int, T_map_camera: np.ndarray) -> Track:

@@ -155,9 +155,7 @@ def fixed_building(scene: SceneFile) -> SceneFile:
     if scene.static.seed is not None:
         return scene
     static = scene.static.model_copy(update={"seed": 0})
-    copy = scene.model_copy(update={"static": static})
-    copy._path = scene.path
-    return copy
+    return scene.model_copy(update={"static": static})
 
 
 def furniture_of(scene: SceneFile) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from simtrack.contracts import Belief
 from simtrack.simulation.ground_truth import Truth
+from simtrack.simulation.scene_file import SceneFile
 
 if TYPE_CHECKING:
     from simtrack.simulation.simulation import Simulation
@@ -50,6 +51,10 @@ class Task(ABC):
     """Name of the scene, see `simtrack scenes`."""
     seconds: float = 30.0
     """Length of an episode; then it is truncated."""
+
+    def adapt(self, scene: SceneFile) -> SceneFile:
+        """The scene as the task wants it, before the world is built."""
+        return scene
 
     def prepare(self, simulation: "Simulation") -> None:  # noqa: B027
         """The world is built (once for many episodes): look up what `score` needs."""

@@ -119,7 +119,9 @@ class IdealPerception:
                 thing = truth.objects[name]
                 self._last[name] = _track(number, thing, truth.stamp, truth.stamp, visible[name], T_camera_map)
             elif name in self._last:
+                last = self._last[name]
                 self._last[name] = replace(
-                    self._last[name], status=TrackStatus.OUT_OF_VIEW, stamp=truth.stamp, visible_fraction=0.0
-                )
+                    last, status=TrackStatus.OUT_OF_VIEW, stamp=truth.stamp, visible_fraction=0.0,
+                    T_camera_object=T_camera_map @ last.T_map_object,
+                )  # fmt: skip
         return _belief(truth, tuple(self._last[name] for name in self._names if name in self._last), frozenset())

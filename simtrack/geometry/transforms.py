@@ -36,19 +36,19 @@ def log_so3(rotation: Float64) -> Float64:
 
 def quaternion_from_rotation(rotation: Float64) -> Float64:
     """(4,) unit quaternion wxyz with w >= 0 of a (3, 3) rotation matrix (Shepperd's method)."""
-    m = np.asarray(rotation, dtype=float)
-    trace = m[0, 0] + m[1, 1] + m[2, 2]
-    choice = int(np.argmax([trace, m[0, 0], m[1, 1], m[2, 2]]))
-    if choice == 0:
-        wxyz = np.array([1.0 + trace, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    m = np.asarray(rotation, dtype=float).tolist()  # plain numbers are several times faster than elements of arrays
+    trace = m[0][0] + m[1][1] + m[2][2]
+    largest = max(trace, m[0][0], m[1][1], m[2][2])
+    if trace == largest:
+        wxyz = np.array([1.0 + trace, m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]])
     else:
-        i = choice - 1
+        i = 0 if m[0][0] == largest else 1 if m[1][1] == largest else 2
         j, k = (i + 1) % 3, (i + 2) % 3
         wxyz = np.empty(4)
-        wxyz[0] = m[k, j] - m[j, k]
-        wxyz[1 + i] = 1.0 + m[i, i] - m[j, j] - m[k, k]
-        wxyz[1 + j] = m[j, i] + m[i, j]
-        wxyz[1 + k] = m[k, i] + m[i, k]
+        wxyz[0] = m[k][j] - m[j][k]
+        wxyz[1 + i] = 1.0 + m[i][i] - m[j][j] - m[k][k]
+        wxyz[1 + j] = m[j][i] + m[i][j]
+        wxyz[1 + k] = m[k][i] + m[i][k]
     wxyz /= np.sqrt(wxyz @ wxyz)
     return -wxyz if wxyz[0] < 0.0 else wxyz
 

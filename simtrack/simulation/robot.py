@@ -1,5 +1,6 @@
 """The robot as bodies and actuators in MuJoCo, and the controllers that turn a `Command` into actuation."""
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -153,8 +154,8 @@ class RobotController:
     def step(self, data: "mujoco.MjData", command: Command) -> None:
         """Set the actuators for one physics step."""
         dt = self.timestep
-        linear = float(np.clip(command.linear, -MAX_LINEAR, MAX_LINEAR))
-        angular = float(np.clip(command.angular, -MAX_ANGULAR, MAX_ANGULAR))
+        linear = min(max(float(command.linear), -MAX_LINEAR), MAX_LINEAR)
+        angular = min(max(float(command.angular), -MAX_ANGULAR), MAX_ANGULAR)
         self.linear = _lagged(self.linear, linear, LINEAR_ACCELERATION, dt)
         self.angular = _lagged(self.angular, angular, ANGULAR_ACCELERATION, dt)
         for name, target in ((TORSO, command.torso), (HEAD_PAN, command.head_pan), (HEAD_TILT, command.head_tilt)):
@@ -167,7 +168,7 @@ class RobotController:
 
     def _write(self, data: "mujoco.MjData") -> None:
         yaw = float(data.qpos[self._qpos[2]])
-        speeds = (self.linear * np.cos(yaw), self.linear * np.sin(yaw), self.angular)
+        speeds = (self.linear * math.cos(yaw), self.linear * math.sin(yaw), self.angular)
         data.ctrl[self._actuator] = (*speeds, *self._setpoint.values())
 
 
@@ -183,7 +184,7 @@ def _profiled(
     """Next setpoint and rate of a trapezoidal profile that comes to rest at the target."""
     error = target - position
     # The braking parabola, started one step early so that the discrete profile does not overshoot.
-    brake = np.sqrt(2.0 * acceleration * abs(error) + (0.5 * acceleration * dt) ** 2) - 0.5 * acceleration * dt
-    wanted = float(np.copysign(min(max_rate, brake, abs(error) / dt), error))
+    brake = math.sqrt(2.0 * acceleration * abs(error) + (0.5 * acceleration * dt) ** 2) - 0.5 * acceleration * dt
+    wanted = math.copysign(min(max_rate, brake, abs(error) / dt), error)
     rate += min(max(wanted - rate, -acceleration * dt), acceleration * dt)
     return position + rate * dt, rate

@@ -15,7 +15,7 @@ STEP = 0.1
 """Seconds that a step stands for in the reward."""
 UNEXPLAINED = 2.0
 """Weight of the share of measurements that nothing explains, against that of the objects' errors."""
-SUCCESS = 0.7
+SUCCESS = 0.8
 """Mean share of known objects over an episode from which on it counts as a success."""
 
 
