@@ -6,10 +6,12 @@ import numpy as np
 
 from simtrack.contracts import Belief, Command, JointState, Odometry, RgbdFrame
 from simtrack.envs.observations import Proprioception
+from simtrack.envs.resolution import noise_in_small_images, stack_config
 from simtrack.envs.settings import CONTROL_NS, Settings, pixel_scale
 from simtrack.envs.truth import IdealPerception, true_belief
 from simtrack.perception.localization import MeshLocalizer
 from simtrack.perception.pipeline import PerceptionStack
+from simtrack.sensors.depth_noise import PRESETS
 from simtrack.simulation.ground_truth import Truth
 from simtrack.simulation.oracles import OracleDetector
 from simtrack.simulation.scene_file import SceneFile
@@ -45,6 +47,7 @@ class Loop:
         """Build the world; raises SimtrackError for a scene that cannot be built."""
         self._settings = settings
         camera = settings.camera
+        scene = _with_noise(scene, pixel_scale(camera))
         self.simulation = Simulation(
             scene, BUILDING_SEED, settings.renderer, camera, settings.lidar,
             sensors=settings.sensors, sleep=True, memory=MEMORY,
@@ -82,6 +85,7 @@ class Loop:
             simulation.robot,
             OracleDetector(simulation.truth, simulation.models, seed, errors),
             T_map_base=simulation.start,
+            config=stack_config(pixel_scale(simulation.camera)),
         )
 
     def step(self, command: Command) -> Snapshot:
@@ -120,3 +124,12 @@ class Loop:
         """Release everything; may be called twice."""
         self._end_stack()
         self.simulation.close()
+
+
+def _with_noise(scene: SceneFile, scale: float) -> SceneFile:
+    """The scene with its depth noise as it looks in images `scale` times as large; what the scene says stays."""
+    sensors = scene.sensors
+    if sensors.depth not in PRESETS:  # which the simulation will refuse
+        return scene
+    noise = {**noise_in_small_images(sensors.depth, scale), **sensors.depth_noise}
+    return scene.model_copy(update={"sensors": sensors.model_copy(update={"depth_noise": noise})})
