@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import simtrack
 from simtrack.cli import console
 from simtrack.cli.bench import bench
+from simtrack.cli.env import env
 from simtrack.cli.generate import generate
 from simtrack.cli.inspect import inspect
 from simtrack.cli.objects import objects
@@ -20,6 +21,7 @@ from simtrack.cli.validate import validate
 VERBS = {
     "run": run,
     "replay": replay,
+    "env": env,
     "generate": generate,
     "inspect": inspect,
     "validate": validate,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtrack.contracts import Belief, Command, JointState, Odometry, RgbdFrame
+from simtrack.contracts import Belief, Command, DetectionResult, JointState, Odometry, RgbdFrame, SensorFrame
 from simtrack.envs.observations import Proprioception
 from simtrack.envs.resolution import noise_in_small_images, stack_config
 from simtrack.envs.settings import CONTROL_NS, Settings, pixel_scale
@@ -35,6 +35,8 @@ class Snapshot:
     felt: Proprioception
     image: RgbdFrame | None
     """The camera's image, where there is one."""
+    feed: tuple[SensorFrame | DetectionResult, ...] = ()
+    """What arrived since the last step: sensor frames, and the detector's answers after the images they belong to."""
 
 
 class Loop:
@@ -57,6 +59,7 @@ class Loop:
         self._felt = Proprioception(JointState(0, (), np.zeros(0)), 0.0, 0.0)
         self._image: RgbdFrame | None = None
         self._belief: Belief | None = None
+        self._feed: list[SensorFrame | DetectionResult] = []
 
     @property
     def has_stack(self) -> bool:
@@ -75,6 +78,7 @@ class Loop:
                 if isinstance(old.localizer, MeshLocalizer) and isinstance(self._stack.localizer, MeshLocalizer):
                     self._stack.localizer.share_search_map(old.localizer)
                 old.close()
+            self._stack.on_detection = self._feed.append
 
     def _make_stack(self, seed: int) -> PerceptionStack:
         simulation = self.simulation
@@ -93,7 +97,9 @@ class Loop:
         simulation, colours = self.simulation, "rgbd" in self._settings.modes
         if self._stack is not None:
             colours = colours or self._stack.wants_image(simulation.now + CONTROL_NS)
+        self._feed.clear()
         for frame in simulation.advance(command, want_rgb=colours):
+            self._feed.append(frame)
             if isinstance(frame, JointState):
                 self._felt = Proprioception(frame, self._felt.linear, self._felt.angular)
             elif isinstance(frame, Odometry):
@@ -113,7 +119,7 @@ class Loop:
             belief = self._ideal.process(truth, visible) if self._stack is None else None
         belief = belief or self._belief
         assert belief is not None
-        return Snapshot(truth, belief, state, self._felt, self._image)
+        return Snapshot(truth, belief, state, self._felt, self._image, tuple(self._feed))
 
     def _end_stack(self) -> None:
         if self._stack is not None:
