@@ -20,6 +20,7 @@ from simtrack.envs.settings import (
 )
 from simtrack.envs.task import Moment, Score, Task
 from simtrack.envs.tasks import make_task
+from simtrack.envs.window import check_display, has_display
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.simulation.scene_file import load_scene
 
@@ -76,6 +77,8 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         chosen = with_objects(load_scene(scene or self.task.scene), self.settings.objects)
         self.scene = self.task.adapt(fixed_building(chosen))
         self.render_mode = self._checked(render_mode)
+        if not has_display():
+            self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}  # type: ignore[misc]
         camera = self.settings.camera
         seconds = self.settings.seconds or self.task.seconds
         self.layout = Layout(
@@ -103,8 +106,6 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InvalidValueError("render_mode", render_mode, f"None, {', '.join(self.metadata['render_modes'])}")
         if render_mode == "human":
-            from simtrack.envs.window import check_display
-
             check_display()
         return render_mode
 

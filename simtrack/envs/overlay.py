@@ -47,13 +47,13 @@ def draw_belief(
 
 
 def write_lines(picture: Uint8, lines: Sequence[str]) -> None:
-    """Write lines of text into the upper left corner of a picture (H, W, 3), in place."""
+    """Write lines of text onto a darkened strip at the top of a picture (H, W, 3), in place."""
     import cv2
 
+    picture[: 16 * len(lines) + 8] //= 3
     for k, line in enumerate(lines):
-        at = (8, 18 + 16 * k)
-        for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(picture, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, width, cv2.LINE_AA)
+        at = (8, 17 + 16 * k)
+        cv2.putText(picture, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA)
 
 
 def _box(out: Uint8, intrinsics: CameraIntrinsics, corners: Float64, color: tuple[int, int, int]) -> None:

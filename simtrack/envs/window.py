@@ -1,7 +1,15 @@
 """A window that shows pictures, by Tk: part of Python, and needs a display."""
 
+import os
+import sys
+
 from simtrack.contracts import Uint8
 from simtrack.errors import RenderingError
+
+
+def has_display() -> bool:
+    """Whether there seems to be a display, told without opening a window."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def check_display() -> None:
