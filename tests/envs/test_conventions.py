@@ -20,8 +20,16 @@ from tests.envs.conftest import FEW
 Make = Callable[..., SimtrackEnv]
 
 
-@pytest.mark.parametrize("name", ["ActivePerception", "Localize"])
-@pytest.mark.parametrize("mode", ["state", "rgbd", ["belief", "state"]], ids=str)
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [
+        ("ActivePerception", "state"),
+        ("ActivePerception", "rgbd"),
+        ("ActivePerception", ["belief", "rgbd"]),
+        ("Localize", "state"),
+    ],
+    ids=str,
+)
 def test_check_env_finds_nothing(make: Make, name: str, mode: Any) -> None:
     """Warnings are errors in these tests."""
     check_env(make(name, observation=mode, render_mode="rgb_array"), skip_render_check=name == "Localize")

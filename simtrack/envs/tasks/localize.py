@@ -22,9 +22,9 @@ RIGHT_TRANSLATION, RIGHT_ROTATION = 0.1, np.radians(5.0)
 """Metres and radians within which the robot counts as localized."""
 ATE_ASKED = 0.05
 """Metres: largest root mean square error of the poses that were claimed, for a success."""
-SHARE_ASKED = 0.6
+SHARE_ASKED = 0.8
 """Least share of the episode that the robot is localized, for a success."""
-WAY_ASKED = 3.0
+WAY_ASKED = 10.0
 """Metres that have to be driven, for a success."""
 
 
