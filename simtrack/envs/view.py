@@ -35,7 +35,7 @@ class View:
     def picture(self, truth: Truth) -> Uint8:
         """(480, 640, 3) picture of the moment, a fresh array."""
         rays = self._truth.rays(truth.stamp)
-        return ray_image(rays, self._bundle, self.pose(truth), SIZE[::-1], self._hits)
+        return ray_image(rays, self._bundle, self.pose(truth), (SIZE[1], SIZE[0]), self._hits)
 
     def pose(self, truth: Truth) -> Float64:
         """(4, 4) T_map_camera for the moment."""

@@ -38,6 +38,8 @@ class Window:
         """Show (H, W, 3)."""
         import tkinter
 
+        if self._root is None:
+            raise RenderingError("the window is closed")
         height, width = picture.shape[:2]
         data = b"P6 %d %d 255 " % (width, height) + picture.tobytes()
         self._image = tkinter.PhotoImage(data=data, format="ppm")

@@ -434,7 +434,10 @@ def _settle(world: World, poses: Mapping[str, Float64], start: tuple[float, floa
     controller.place(data, *start)
     data.qvel[:] = 0.0
     data.time = 0.0
+    flags, sleep = int(model.opt.enableflags), int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    model.opt.enableflags = flags & ~sleep  # awake at time 0: what sleeps has no contacts to be told of
     mujoco.mj_forward(model, data)
+    model.opt.enableflags = flags
 
     things = {thing.id: f"objects.{k}" for k, thing in enumerate(scene.objects)}
     things |= {thing.id: f"clutter.{k}" for k, thing in enumerate(scene.clutter)}

@@ -78,7 +78,7 @@ def test_vectors_of_environments(mode: str) -> None:
         assert not np.array_equal(first["position"][0], first["position"][1])
         ended = 0
         for _ in range(6):
-            observation, reward, terminated, truncated, _ = envs.step(np.zeros(envs.action_space.shape, np.float32))
+            observation, reward, terminated, truncated, _ = envs.step(np.zeros((envs.num_envs, 5), np.float32))
             assert observation in envs.observation_space and np.isfinite(reward).all()
             ended += int(np.count_nonzero(truncated | terminated))
         assert ended == envs.num_envs  # and went on with new episodes

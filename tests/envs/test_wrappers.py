@@ -1,5 +1,6 @@
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import cv2
 import gymnasium as gym
@@ -8,6 +9,7 @@ import pytest
 
 from simtrack.envs.actions import MOVES
 from simtrack.envs.environment import SimtrackEnv
+from simtrack.envs.observations import Arrays
 from simtrack.envs.wrappers import DiscreteActions, FlatBelief, Recorder, Video
 from simtrack.errors import InvalidValueError, UnknownNameError
 from simtrack.geometry.transforms import transform_planar
@@ -28,7 +30,7 @@ def test_discrete_moves_do_what_they_are_called(make: Make) -> None:
 def test_a_flat_belief_does_not_depend_on_where_the_map_has_its_origin(make: Make) -> None:
     env = make()
     flat = FlatBelief(env)
-    arrays, _ = env.reset(seed=0)
+    arrays = cast(Arrays, env.reset(seed=0)[0])
     moved = {key: value.copy() for key, value in arrays.items()}
     T = transform_planar(3.0, -2.0, 0.7)
     mask = moved["mask"].astype(bool)
@@ -36,7 +38,7 @@ def test_a_flat_belief_does_not_depend_on_where_the_map_has_its_origin(make: Mak
     moved["velocity"] = np.concatenate([moved["velocity"][:, k : k + 3] @ T[:3, :3].T for k in (0, 3)], axis=1)
     x, y, c, s = moved["base"]
     heading = np.arctan2(s, c) + 0.7
-    moved["base"] = np.array([*(T[:2, :2] @ [x, y] + T[:2, 3]), np.cos(heading), np.sin(heading)], np.float32)
+    moved["base"] = np.array([*(T[:2, :2] @ np.array([x, y]) + T[:2, 3]), np.cos(heading), np.sin(heading)], np.float32)
     np.testing.assert_allclose(flat.observation(arrays), flat.observation(moved), atol=2e-5)
     assert flat.observation(arrays) in flat.observation_space
     with pytest.raises(UnknownNameError, match="state"):
