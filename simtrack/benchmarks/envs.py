@@ -89,7 +89,7 @@ def _simulate(env: gym.Env, actions: Sequence[Float32], seed: int, on: bool) -> 
     times = []
     with Simulation(
         inner.scene, BUILDING_SEED, settings.renderer, settings.camera, settings.lidar,
-        sensors=sensors, sleep=True, memory=MEMORY,
+        sensors=sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
     ) as simulation:  # fmt: skip
         simulation.restart(seed)
         for action in actions:

@@ -52,7 +52,7 @@ class Loop:
         scene = _with_noise(scene, pixel_scale(camera))
         self.simulation = Simulation(
             scene, BUILDING_SEED, settings.renderer, camera, settings.lidar,
-            sensors=settings.sensors, sleep=True, memory=MEMORY,
+            sensors=settings.sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
         )  # fmt: skip
         self._ideal = IdealPerception(self.simulation, camera)
         self._stack: PerceptionStack | None = None

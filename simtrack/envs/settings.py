@@ -15,6 +15,7 @@ from simtrack.sensors.lidar import VLP16, LidarModel
 from simtrack.simulation.oracles.detector import OracleDetectorConfig
 from simtrack.simulation.rendering import RENDERERS
 from simtrack.simulation.scene_file import SceneFile, parse_scene
+from simtrack.simulation.simulation import PROPRIOCEPTION_NS
 
 CONTROL_HZ = 10
 """Steps a second of simulated time; camera and lidar look as often."""
@@ -101,6 +102,11 @@ class Settings:
         elif "rgbd" in self.modes:
             sensors += ["camera"]
         return tuple(sensors)
+
+    @property
+    def proprioception(self) -> int:
+        """Nanoseconds between readings of wheels and joints: a localizer wants 50 a second, an agent one a step."""
+        return PROPRIOCEPTION_NS if "belief" in self.modes else CONTROL_NS
 
     def detector_config(self, scale: float) -> OracleDetectorConfig:
         """Errors of the oracle detector; sizes in pixels are multiplied by `scale`, as the images are."""

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from simtrack.sensors.depth_noise import DepthDraws
 
 PROPRIOCEPTION_NS = 20_000_000
-"""Nanoseconds between odometry readings and between joint states: 50 Hz."""
+"""Nanoseconds between odometry readings and between joint states, unless told otherwise: 50 Hz."""
 START_SIGMA = np.array([0.03, 0.03, np.deg2rad(2.0)])
 """How well the robot is told where it starts: standard deviations of x, y, metres, and heading, radians."""
 SENSORS = ("camera", "lidar", "proprioception")
@@ -67,6 +67,7 @@ class Simulation:
         sensors: Collection[str] = SENSORS,
         sleep: bool = False,
         memory: int | None = None,
+        proprioception: int = PROPRIOCEPTION_NS,
     ) -> None:
         """Build the world of `scene` for `seed` and let it settle; stamp 0 is the moment after.
 
@@ -79,6 +80,7 @@ class Simulation:
             sensors: which of `SENSORS` are on.
             sleep: leave things that rest out of the physics until something touches them.
             memory: nanoseconds of the past that `truth` can be asked about at least; all of it if None.
+            proprioception: nanoseconds between odometry readings and between joint states.
 
         Raises:
             SimtrackError: whatever is wrong with the scene; see `build_world`.
@@ -90,6 +92,7 @@ class Simulation:
         self.scene, self.seed = scene, seed
         self._building = seed
         self.camera, self.lidar, self._sensors = camera, lidar, frozenset(sensors)
+        self._proprioception = proprioception
         intrinsics = camera.intrinsics
         fovy = 2.0 * np.arctan(intrinsics.height / (2.0 * intrinsics.fy))
         self.world = build_world(scene, seed, float(fovy), (intrinsics.width, intrinsics.height), sleep)
@@ -239,7 +242,7 @@ class Simulation:
         target = self._counts["camera"] * self.camera_period
         while self._history.end < target:
             self._step(command)
-        self._due(PROPRIOCEPTION_NS, "proprioception", target, self._send_proprioception)
+        self._due(self._proprioception, "proprioception", target, self._send_proprioception)
         self._now = target
         # The lidar looks while the camera is rendered, unless both cast rays into the same scene.
         scans = self._worker.submit(self._due, self.lidar.period, "lidar", target - self.lidar.period, self._send_scan)

@@ -33,7 +33,7 @@ def test_a_policy_repeats_itself_for_a_seed(make: Make, policy: str) -> None:
 
 
 def test_looking_around_finds_what_a_fixed_gaze_does_not(make: Make) -> None:
-    env = make(objects=("relay", "powerdrill"), seconds=6.0)
+    env = make(objects=("relay", "powerdrill"), seconds=10.0)
     still, scripted = (next(play(env, policy, [1], "state")) for policy in ("still", "scripted"))
     assert scripted.metrics["known"] == 1.0 > still.metrics["known"]
 
