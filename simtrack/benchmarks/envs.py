@@ -14,7 +14,7 @@ import numpy as np
 
 from simtrack.benchmarks.harness import Benchmark, Options, Timing
 from simtrack.contracts import Float32
-from simtrack.envs.loop import BUILDING_SEED, MEMORY
+from simtrack.envs.loop import BUILDING_SEED, MEMORY, SCAN_KEY
 from simtrack.envs.policies import make_policy
 from simtrack.envs.wrappers import simtrack_env
 from simtrack.simulation.simulation import Simulation
@@ -90,6 +90,7 @@ def _simulate(env: gym.Env, actions: Sequence[Float32], seed: int, on: bool) -> 
     with Simulation(
         inner.scene, BUILDING_SEED, settings.renderer, settings.camera, settings.lidar,
         sensors=sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
+        scan_key=SCAN_KEY,
     ) as simulation:  # fmt: skip
         simulation.restart(seed)
         for action in actions:

@@ -197,9 +197,9 @@ class Encoder:
         rows = {graph_name(track): slot for slot, track in kept}
         columns = rows | self._furniture
         for relation in belief.relations:
-            row, column = rows.get(relation.subject), columns.get(relation.reference)
-            if row is not None and column is not None:
-                out["relations"][row, column, self._relation[relation.name]] = 1
+            if relation.subject in rows and relation.reference in columns:
+                at = rows[relation.subject], columns[relation.reference], self._relation[relation.name]
+                out["relations"][at] = 1
 
     def _look(self, out: Arrays, belief: Belief) -> None:
         """What nothing explains; between segmented images the share of the last one holds."""

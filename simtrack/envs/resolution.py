@@ -7,6 +7,8 @@ from simtrack.perception.pipeline import StackConfig
 from simtrack.perception.tracking.registration_config import RegistrationConfig, Step
 from simtrack.sensors.depth_noise import PRESETS
 
+LIDAR_SEGMENTS = 5
+"""Every how many-th scan is segmented: what stands in the way of a robot stands there for longer than half a second."""
 FEWEST_RAYS, FEWEST_EDGES = 8, 4
 """However small an image is, so many rays must confirm a pose, and so many silhouette pixels a new object."""
 
@@ -33,7 +35,7 @@ def stack_config(scale: float) -> StackConfig:
         growth=max(1, round(seen.growth * scale)),
         join=seen.join / scale,
     )
-    return replace(stack, tracker=tracker, presegmentation=seen)
+    return replace(stack, tracker=tracker, presegmentation=seen, lidar_presegmentation_every=LIDAR_SEGMENTS)
 
 
 def _registration(config: RegistrationConfig, scale: float) -> RegistrationConfig:
@@ -46,7 +48,8 @@ def _registration(config: RegistrationConfig, scale: float) -> RegistrationConfi
         schedule=tuple(scaled(step) for step in config.schedule),
         track_schedule=tuple(scaled(step) for step in config.track_schedule),
         near=scaled(config.near),
-        finish=None if config.finish is None else scaled(config.finish),
+        # In small images every step looks at each pixel anyhow: one more at full resolution would tell nothing new.
+        finish=None if scale <= 0.5 else config.finish,
         correlation_area=max(1.0, config.correlation_area * scale**2),
         edge_correlation=max(1.0, config.edge_correlation * scale),
     )

@@ -183,6 +183,8 @@ def _profiled(
 ) -> tuple[float, float]:
     """Next setpoint and rate of a trapezoidal profile that comes to rest at the target."""
     error = target - position
+    if error == 0.0 == rate:
+        return position, rate
     # The braking parabola, started one step early so that the discrete profile does not overshoot.
     brake = math.sqrt(2.0 * acceleration * abs(error) + (0.5 * acceleration * dt) ** 2) - 0.5 * acceleration * dt
     wanted = math.copysign(min(max_rate, brake, abs(error) / dt), error)

@@ -68,6 +68,7 @@ class Simulation:
         sleep: bool = False,
         memory: int | None = None,
         proprioception: int = PROPRIOCEPTION_NS,
+        scan_key: int = KEY_NS,
     ) -> None:
         """Build the world of `scene` for `seed` and let it settle; stamp 0 is the moment after.
 
@@ -81,6 +82,7 @@ class Simulation:
             sleep: leave things that rest out of the physics until something touches them.
             memory: nanoseconds of the past that `truth` can be asked about at least; all of it if None.
             proprioception: nanoseconds between odometry readings and between joint states.
+            scan_key: nanoseconds between the moments of a lidar's turn that its motion is interpolated from.
 
         Raises:
             SimtrackError: whatever is wrong with the scene; see `build_world`.
@@ -92,7 +94,7 @@ class Simulation:
         self.scene, self.seed = scene, seed
         self._building = seed
         self.camera, self.lidar, self._sensors = camera, lidar, frozenset(sensors)
-        self._proprioception = proprioception
+        self._proprioception, self._scan_key = proprioception, scan_key
         intrinsics = camera.intrinsics
         fovy = 2.0 * np.arctan(intrinsics.height / (2.0 * intrinsics.fy))
         self.world = build_world(scene, seed, float(fovy), (intrinsics.width, intrinsics.height), sleep)
@@ -327,7 +329,7 @@ class Simulation:
 
     def _send_scan(self, stamp: int) -> None:
         """One turn: each shot is cast from where sensor and objects are at its own time."""
-        shots, keys = self._shots, round(self.lidar.period / KEY_NS) + 1
+        shots, keys = self._shots, round(self.lidar.period / self._scan_key) + 1
         poses, sensor = [], np.empty((keys, 4, 4))
         for k in range(keys):
             self._history.load(stamp + k * self.lidar.period / (keys - 1), self._scan_scratch)
