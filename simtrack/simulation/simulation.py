@@ -33,10 +33,13 @@ from simtrack.simulation.history import KEY_NS, History
 from simtrack.simulation.randomness import stream
 from simtrack.simulation.rendering import make_renderer
 from simtrack.simulation.scene_file import SceneFile
-from simtrack.simulation.world import SENSOR_BODIES, TIMESTEP_NS, build_world, configured, rearrange
+from simtrack.simulation.settling import rearrange
+from simtrack.simulation.world import SENSOR_BODIES, TIMESTEP_NS, build_world, configured
 from simtrack.simulation.world_rays import WorldRays
 
 if TYPE_CHECKING:
+    import mujoco
+
     from simtrack.sensors.depth_noise import DepthDraws
 
 PROPRIOCEPTION_NS = 20_000_000
@@ -255,6 +258,11 @@ class Simulation:
             self._draws = self._worker.submit(self._draw_noise)
         scans.result()
         return self._feed.receive(target)
+
+    def state(self, stamp: int) -> "mujoco.MjData":
+        """Body poses at a stamp, to be read before the next call: for what acts inside of the world."""
+        self._history.load(stamp, self._scratch)
+        return self._scratch
 
     def carry_robot(self, x: float, y: float, yaw: float) -> None:
         """Lift the robot and put it down at rest elsewhere, now: its wheels do not feel it (kidnapping).

@@ -13,7 +13,7 @@ from simtrack.geometry.kinematics import KinematicTree, Link
 from simtrack.geometry.meshes import Mesh, area, painted
 from simtrack.geometry.transforms import quaternion_from_rotation, transform
 from simtrack.objects import ObjectModel, load_object
-from simtrack.objects.tiago import CAMERA, LIDAR, TUCKED, tiago
+from simtrack.objects.tiago import CAMERA, GRIPPER, LIDAR, tiago
 from simtrack.simulation import hand
 from simtrack.simulation.building.parts import StaticWorld
 from simtrack.simulation.placement import place_objects, start_pose
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 TIMESTEP_NS = 2_000_000
 """Physics step, nanoseconds."""
-SETTLE_SECONDS = 1.5
-"""How long physics lets things come to rest before time 0."""
 
 SHOWN, COLOR_ONLY, DEPTH_ONLY, COLLISION = 0, 1, 2, 3
 """Geom groups: seen always, in RGB images only, in depth and id images only, never."""
@@ -161,6 +159,8 @@ def build_world(
         FileFormatError: the scene names things that do not exist, has no room for them, or its MJCF is broken.
         UnknownNameError: an object that is not in the catalogue; lists those that are.
     """
+    from simtrack.simulation.settling import settle
+
     static = build_static(scene, seed)
     models = _models(scene)
     start = start_pose(scene, static, stream(seed, "start"))
@@ -178,26 +178,13 @@ def build_world(
         trackable = any(thing.id == name for thing in scene.objects)
         _add_object(composer, name, model, poses[name], "catalogue" if trackable else "clutter")
     _add_robot(composer, robot, fovy)
+    if scene.robot.suction:
+        _add_suction(composer, models)
     if scene.hand is not None:
         _add_hand(composer, scene)
     world = _assembled(scene, seed, composer, static, robot, models)
-    _settle(world, poses, start)
+    settle(world, poses, start)
     return world
-
-
-def rearrange(world: World, seed: int) -> None:
-    """Begin anew in the same building: places and start are drawn from `seed`, then everything settles.
-
-    The model stays as it was compiled, so that this takes a fraction of the time of `build_world`; the building, which
-    the model holds, stays that of the seed that the world was built with.
-
-    Raises:
-        FileFormatError: there is no room for the things of the scene, or one does not rest where it is put.
-    """
-    start = start_pose(world.scene, world.static, stream(seed, "start"))
-    poses = place_objects(world.scene, world.static, dict(world.objects), stream(seed, "placement"))
-    world.seed = seed
-    _settle(world, poses, start)
 
 
 def build_static(scene: SceneFile, seed: int) -> StaticWorld:
@@ -357,6 +344,17 @@ def _add_robot(composer: _Composer, robot: KinematicTree, fovy: float) -> None:
     camera.fovy = float(np.degrees(fovy))
 
 
+def _add_suction(composer: _Composer, models: Mapping[str, ObjectModel]) -> None:
+    """A constraint for each object that ties it to the gripper while the cup holds it."""
+    import mujoco
+
+    for name in models:
+        composer.spec.add_equality(
+            name=f"suction/{name}", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1=ROBOT + GRIPPER, name2=f"object/{name}", active=False, solref=[0.012, 1.0],
+        )  # fmt: skip
+
+
 def _add_hand(composer: _Composer, scene: SceneFile) -> None:
     import mujoco
 
@@ -394,6 +392,8 @@ def _assembled(
     """The compiled world before physics has begun."""
     import mujoco
 
+    from simtrack.simulation.settling import standing
+
     model = composer.finish()
     bodies = {name: model.body(f"object/{name}").id for name in models}
     bodies["robot"] = model.body(ROBOT + "base").id
@@ -404,48 +404,8 @@ def _assembled(
     )
     names = tuple(dict.fromkeys(instance.name for instance in instances))
     owners = _geom_owners(model, instances, names)
-    data, controller = mujoco.MjData(model), _controller(scene, model, robot)
+    data, controller = mujoco.MjData(model), standing(scene, model, robot)
     return World(scene, seed, model, data, static, robot, controller, models, instances, names, owners, bodies)
-
-
-def _controller(scene: SceneFile, model: "mujoco.MjModel", robot: KinematicTree) -> RobotController:
-    """A controller with the robot at rest in the posture that the scene asks for."""
-    joints = {
-        "torso_lift_joint": scene.robot.torso,
-        "head_1_joint": scene.robot.head_pan,
-        "head_2_joint": scene.robot.head_tilt,
-    }
-    return RobotController(model, robot, {**TUCKED, **joints}, TIMESTEP_NS * 1e-9)
-
-
-def _settle(world: World, poses: Mapping[str, Float64], start: tuple[float, float, float]) -> None:
-    """Put things and robot there, let physics bring everything to rest, and check that it rests where it was put."""
-    import mujoco
-
-    scene, model, data = world.scene, world.model, world.data
-    mujoco.mj_resetData(model, data)
-    for name, T in poses.items():
-        address = int(model.joint(f"object/{name}").qposadr[0])
-        data.qpos[address : address + 3] = T[:3, 3]
-        data.qpos[address + 3 : address + 7] = quaternion_from_rotation(T[:3, :3])
-    world.controller = controller = _controller(scene, model, world.robot)
-    controller.place(data, *start)
-    mujoco.mj_step(model, data, nstep=round(SETTLE_SECONDS / (TIMESTEP_NS * 1e-9)))
-    controller.place(data, *start)
-    data.qvel[:] = 0.0
-    data.time = 0.0
-    flags, sleep = int(model.opt.enableflags), int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    model.opt.enableflags = flags & ~sleep  # awake at time 0: what sleeps has no contacts to be told of
-    mujoco.mj_forward(model, data)
-    model.opt.enableflags = flags
-
-    things = {thing.id: f"objects.{k}" for k, thing in enumerate(scene.objects)}
-    things |= {thing.id: f"clutter.{k}" for k, thing in enumerate(scene.clutter)}
-    for name in poses:
-        moved = float(np.linalg.norm(data.xpos[world.bodies[name]] - poses[name][:3, 3]))
-        if not moved < 0.05:
-            reason = f"'{name}' does not rest where it is put: it moved by {moved:.2f} m while settling"
-            raise FileFormatError(scene.path, f"{things[name]}.place", reason)
 
 
 def _geom_owners(model: "mujoco.MjModel", instances: tuple[Instance, ...], names: tuple[str, ...]) -> Int32:
