@@ -11,12 +11,16 @@ from simtrack.geometry.transforms import transform
 from simtrack.objects.tiago import GRIPPER, TORSO, TUCKED
 from simtrack.simulation.suction import CUP
 
+SHOULDER = 0.138
+"""Metres from the base's centre to the arm's first axis, along x."""
 ARM = tuple(f"arm_{k}_joint" for k in range(1, 8))
 READY: Mapping[str, float] = {
-    "arm_1_joint": 0.0, "arm_2_joint": -0.6, "arm_3_joint": 0.0, "arm_4_joint": 1.5, "arm_5_joint": 0.0,
-    "arm_6_joint": 0.67, "arm_7_joint": 0.0,
+    "arm_1_joint": 0.0, "arm_2_joint": -1.05, "arm_3_joint": 0.0, "arm_4_joint": 1.5, "arm_5_joint": 0.0,
+    "arm_6_joint": 1.12, "arm_7_joint": 0.0,
 }  # fmt: skip
-"""Posture before the chest with the cup pointing down: where the search for joint angles begins."""
+"""Posture before the chest, above tables, with the cup pointing down: the search for joint angles begins here."""
+ASIDE: Mapping[str, float] = {**READY, "arm_1_joint": -1.57}
+"""The same beside the robot: on the way from the tucked posture, over the edge of a table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +76,11 @@ class ArmKinematics:
         """
         config = self.config
         q = np.array([start.get(name, TUCKED[name]) for name in ARM])
+        if start is READY:  # turned towards the place, which is where most answers lie
+            q[0] = np.arctan2(position[1], position[0] - SHOULDER)
+            wrist = 0.0 if yaw is None else q[0] + np.pi / 2 - yaw  # the cup's y axis points to the left in READY
+            q[6] = np.arctan2(np.sin(wrist), np.cos(wrist))
+            q = np.clip(q, self._low, self._high)
         home = q.copy()
         for _ in range(config.iterations):
             pose, J = self._linearised(q, torso)

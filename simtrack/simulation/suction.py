@@ -20,6 +20,8 @@ RIM = 0.006
 """Radius of the cup, metres."""
 SEAL = 0.008
 """Metres before the rim within which a surface closes the cup: it is soft."""
+AWAKE = -11
+"""MuJoCo's mark of a tree that stays awake for the next ten steps at least (-1 - mjMINAWAKE)."""
 LEAK = 0.008
 """Largest difference between the distances at the rim, metres: a steeper surface leaves a gap."""
 
@@ -42,6 +44,10 @@ class SuctionCup:
         self.holding: str | None = None
         """Name of the object that it holds."""
 
+    def reset(self) -> None:
+        """Forget what was held: the world has begun anew."""
+        self.holding = None
+
     @property
     def pose(self) -> Float64:
         """(4, 4) T_map_cup as it truly is now: origin in the middle of the rim, x in the direction of sucking."""
@@ -59,7 +65,7 @@ class SuctionCup:
         hits = rays.scene.cast_rays(origins, directions, max_distance=2.0 * SEAL)
         ids = rays.ids(hits)
         names = {simulation.world.names[k] if k >= 0 else "" for k in ids.tolist()}
-        if len(names) != 1 or np.ptp(hits.distances) > LEAK:
+        if len(names) != 1 or not hits.hit.all() or np.ptp(hits.distances) > LEAK:
             return None
         (name,) = names
         return name if name in simulation.world.objects else None
@@ -84,4 +90,6 @@ class SuctionCup:
         if self.holding is not None:
             world = self._simulation.world
             world.data.eq_active[world.model.equality(f"suction/{self.holding}").id] = 0
+            # What was held still has fallen asleep, and a constraint that ends wakes nothing.
+            world.data.tree_asleep[world.model.body_treeid[world.bodies[self.holding]]] = AWAKE
             self.holding = None
