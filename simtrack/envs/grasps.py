@@ -36,12 +36,12 @@ def suction_spot(model: ObjectModel, T_map_object: Float64) -> Float64 | None:
     offsets = np.concatenate([np.zeros((1, 2)), 1.3 * RIM * ring, (RIM + CLEAR) * ring])
     heights = _heights(model, T_map_object, (grid[:, None] + offsets).reshape(-1, 2)).reshape(len(grid), -1)
     spot, around = heights[:, :9], heights[:, 9:]
-    flat = np.isfinite(spot).all(axis=1)
-    flat[flat] = np.ptp(spot[flat], axis=1) <= UNEVEN
-    flat[flat] = (around[flat] - heights[flat, :1] <= HIGHER).all(axis=1)
-    if not flat.any():
+    usable = np.flatnonzero(np.isfinite(spot).all(axis=1))
+    usable = usable[np.ptp(spot[usable], axis=1) <= UNEVEN]
+    usable = usable[(around[usable] - spot[usable, :1] <= HIGHER).all(axis=1)]
+    if len(usable) == 0:
         return None
-    best = int(np.flatnonzero(flat)[np.argmin(np.linalg.norm(grid[flat] - centre[:2], axis=1))])
+    best = int(usable[np.argmin(np.linalg.norm(grid[usable] - centre[:2], axis=1))])
     return np.array([*grid[best], spot[best, 0]])
 
 
