@@ -13,6 +13,7 @@ from simtrack.perception.localization import MeshLocalizer
 from simtrack.perception.pipeline import PerceptionStack
 from simtrack.sensors.depth_noise import PRESETS
 from simtrack.simulation.ground_truth import Truth
+from simtrack.simulation.history import KEY_NS
 from simtrack.simulation.oracles import OracleDetector
 from simtrack.simulation.scene_file import SceneFile
 from simtrack.simulation.simulation import Simulation
@@ -55,7 +56,7 @@ class Loop:
         self.simulation = Simulation(
             scene, BUILDING_SEED, settings.renderer, camera, settings.lidar,
             sensors=settings.sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
-            scan_key=SCAN_KEY,
+            scan_key=SCAN_KEY, servo=KEY_NS,
         )  # fmt: skip
         self._ideal = IdealPerception(self.simulation, camera)
         self._stack: PerceptionStack | None = None

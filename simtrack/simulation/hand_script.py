@@ -86,8 +86,10 @@ class HandDirector:
         """Where the hand is now."""
         return self._pose
 
-    def step(self, data: "mujoco.MjData") -> None:
-        """Move the hand on by one physics step."""
+    def step(self, data: "mujoco.MjData", steps: int = 1) -> None:
+        """Move the hand on by so many physics steps."""
+        for _ in range(steps - 1):
+            next(self._motion)
         pose = next(self._motion)
         if pose is not self._pose:
             self._pose = pose

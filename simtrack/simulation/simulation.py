@@ -18,7 +18,7 @@ from simtrack.contracts import (
     SensorFrame,
     StaticMap,
 )
-from simtrack.errors import FileFormatError, RenderingError, SimtrackError, UnknownNameError
+from simtrack.errors import FileFormatError, InvalidValueError, RenderingError, SimtrackError, UnknownNameError
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import inverse, rotation_from_rpy, transform, transform_planar
 from simtrack.objects import ObjectModel, TrackerModelConfig, tracker_model
@@ -72,6 +72,7 @@ class Simulation:
         memory: int | None = None,
         proprioception: int = PROPRIOCEPTION_NS,
         scan_key: int = KEY_NS,
+        servo: int = TIMESTEP_NS,
     ) -> None:
         """Build the world of `scene` for `seed` and let it settle; stamp 0 is the moment after.
 
@@ -86,18 +87,21 @@ class Simulation:
             memory: nanoseconds of the past that `truth` can be asked about at least; all of it if None.
             proprioception: nanoseconds between odometry readings and between joint states.
             scan_key: nanoseconds between the moments of a lidar's turn that its motion is interpolated from.
+            servo: nanoseconds between the setpoints of robot and hand: a physics step, or two.
 
         Raises:
             SimtrackError: whatever is wrong with the scene; see `build_world`.
         """
         import mujoco
 
+        if servo not in (TIMESTEP_NS, KEY_NS):
+            raise InvalidValueError("servo", servo, f"{TIMESTEP_NS} or {KEY_NS} ns")
         if unknown := sorted(set(sensors) - set(SENSORS)):
             raise UnknownNameError("sensor", unknown[0], SENSORS)
         self.scene, self.seed = scene, seed
         self._building = seed
         self.camera, self.lidar, self._sensors = camera, lidar, frozenset(sensors)
-        self._proprioception, self._scan_key = proprioception, scan_key
+        self._proprioception, self._scan_key, self._servo = proprioception, scan_key, servo
         intrinsics = camera.intrinsics
         fovy = 2.0 * np.arctan(intrinsics.height / (2.0 * intrinsics.fy))
         self.world = build_world(scene, seed, float(fovy), (intrinsics.width, intrinsics.height), sleep)
@@ -147,6 +151,7 @@ class Simulation:
         self._configure()
         self._hand = HandDirector(self.world, stream(seed, "hand")) if self.scene.hand is not None else None
         self._counts: dict[str, int] = dict.fromkeys(SENSORS, 0)
+        self.world.controller.timestep = self._servo / NANOSECONDS
         self._now = 0
         self._T_wheels_map = np.eye(4)
         self._remember()
@@ -289,11 +294,12 @@ class Simulation:
         """Physics from one key of the history to the next."""
         import mujoco
 
-        for _ in range(KEY_NS // TIMESTEP_NS):
+        steps = self._servo // TIMESTEP_NS
+        for _ in range(KEY_NS // self._servo):
             self.world.controller.step(self._data, command)
             if self._hand is not None:
-                self._hand.step(self._data)
-            mujoco.mj_step(self.world.model, self._data)
+                self._hand.step(self._data, steps)
+            mujoco.mj_step(self.world.model, self._data, nstep=steps)
         self._remember()
 
     def _remember(self) -> None:
