@@ -10,7 +10,7 @@ import tyro
 if TYPE_CHECKING:
     from simtrack.benchmarks.harness import Benchmark, Row
 
-Name = Literal["raycast", "tracking", "localization", "relations", "scaling", "realtime", "datasets"]
+Name = Literal["raycast", "tracking", "localization", "relations", "scaling", "realtime", "datasets", "envs"]
 
 
 def bench(

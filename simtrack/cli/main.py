@@ -8,6 +8,7 @@ import simtrack
 from simtrack.cli import console
 from simtrack.cli.bench import bench
 from simtrack.cli.check import check
+from simtrack.cli.env import env
 from simtrack.cli.evaluate import evaluate
 from simtrack.cli.generate import generate
 from simtrack.cli.inspect import inspect
@@ -23,6 +24,7 @@ from simtrack.cli.validate import validate
 VERBS = {
     "run": run,
     "replay": replay,
+    "env": env,
     "generate": generate,
     "inspect": inspect,
     "validate": validate,

@@ -18,6 +18,8 @@ from simtrack.geometry.transforms import transform, transform_xyz_rpy
 TORSO, HEAD_PAN, HEAD_TILT = "torso_lift_joint", "head_1_joint", "head_2_joint"
 """Names of the joints that a `Command` moves."""
 
+GRIPPER = "gripper"
+"""Name of the link that holds things."""
 CAMERA, LIDAR = "camera", "lidar"
 """Names of the links that are sensor frames."""
 

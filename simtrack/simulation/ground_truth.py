@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from simtrack.contracts import NANOSECONDS, CameraIntrinsics, Float64, Int32
+from simtrack.contracts import NANOSECONDS, Bool, CameraIntrinsics, Float64, Int32
 from simtrack.errors import UnknownNameError
 from simtrack.geometry.transforms import apply, difference, inverse
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
@@ -109,7 +109,7 @@ class GroundTruth:
     def at(self, stamp: int) -> Truth:
         """Everything at a stamp."""
         scratch = self._scratch
-        early = max(0, stamp - KEY_NS)
+        early = max(self._history.start, stamp - KEY_NS)
         late = min(self._history.end, stamp + KEY_NS)
         around = []
         for moment in (early, late):
@@ -203,6 +203,12 @@ class GroundTruth:
         while len(self._lidar) > keep:
             del self._lidar[min(self._lidar)]
 
+    def clear(self) -> None:
+        """Forget what was, as the history does: the clock begins anew."""
+        self._contacts.clear()
+        self._lidar.clear()
+        self._seen = None
+
     # -------------------------------------------------------------------------------------------------------- internals
 
     def _load(self, stamp: int) -> None:
@@ -277,6 +283,12 @@ class _ContactLog:
         robot = [k for k, name in enumerate(names) if name == "robot"]
         self._owner = np.where(np.isin(world.geom_owners, robot), -1, world.geom_owners)
         self._is_object = np.array([name in world.objects for name in names])
+        trees = world.model.body_treeid
+        self._trees = np.array([trees[world.bodies[name]] if name in world.objects else -1 for name in names])
+        self._fixed = np.array([name not in world.bodies for name in names])
+        self.clear()
+
+    def clear(self) -> None:
         self._keys: list[int] = []
         self._sets: list[tuple[np.ndarray, np.ndarray]] = []
         self._count = 0
@@ -286,15 +298,24 @@ class _ContactLog:
         contact = data.contact
         stamp, self._count = self._count * KEY_NS, self._count + 1
         geoms, apart, up = contact.geom, contact.dist > 0.0, contact.frame[:, 2]
-        fingerprint = geoms.tobytes() + apart.tobytes() + (np.abs(up) > SUPPORTING).tobytes()
+        asleep = data.tree_asleep >= 0
+        fingerprint = geoms.tobytes() + apart.tobytes() + (np.abs(up) > SUPPORTING).tobytes() + asleep.tobytes()
         if fingerprint == self._last:  # mostly so: things rest
             return
         self._last = fingerprint
         supports, touches = contact_pairs(data, self._owner, self._is_object)
         last = self._sets[-1] if self._sets else None
+        if last is not None and asleep.any():  # physics leaves out the contacts of what sleeps; it goes on touching
+            supports, touches = self._kept(last[0], supports, asleep), self._kept(last[1], touches, asleep)
         if last is None or not (np.array_equal(last[0], supports) and np.array_equal(last[1], touches)):
             self._keys.append(stamp)
             self._sets.append((supports, touches))
+
+    def _kept(self, old: np.ndarray, new: np.ndarray, asleep: Bool) -> np.ndarray:
+        """Pairs (P, 2) of now, with the old ones in which nothing is awake."""
+        tree = self._trees[old]
+        still = (self._fixed[old] | ((tree >= 0) & asleep[tree])).all(axis=1)
+        return np.unique(np.concatenate([old[still], new]), axis=0)
 
     def at(self, stamp: int) -> tuple[frozenset[tuple[str, str]], frozenset[tuple[str, str]]]:
         low = max(0, bisect_right(self._keys, stamp - CONTACT_WINDOW) - 1)

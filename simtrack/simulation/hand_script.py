@@ -7,7 +7,7 @@ import numpy as np
 
 from simtrack.contracts import Float64
 from simtrack.errors import FileFormatError, SimtrackError
-from simtrack.geometry.transforms import exp_so3, interpolate, inverse, quaternion_from_rotation, transform
+from simtrack.geometry.transforms import difference, exp_so3, inverse, perturb, quaternion_from_rotation, transform
 from simtrack.simulation import hand
 from simtrack.simulation.hand import HandPose
 from simtrack.simulation.placement import Area, Outline, is_free, outline, support_area
@@ -34,6 +34,7 @@ GRIP_DEPTH = 0.055
 CLEAR = 0.06
 """Metres that a thing keeps from others when it is put down."""
 TRIES = 200
+SIDES = np.array(hand.SIDES)[:, None]
 INNER = 0.76
 """Share of a container's width that is taken for its clear inside."""
 
@@ -85,8 +86,10 @@ class HandDirector:
         """Where the hand is now."""
         return self._pose
 
-    def step(self, data: "mujoco.MjData") -> None:
-        """Move the hand on by one physics step."""
+    def step(self, data: "mujoco.MjData", steps: int = 1) -> None:
+        """Move the hand on by so many physics steps."""
+        for _ in range(steps - 1):
+            next(self._motion)
         pose = next(self._motion)
         if pose is not self._pose:
             self._pose = pose
@@ -95,7 +98,7 @@ class HandDirector:
     def _apply(self, data: "mujoco.MjData") -> None:
         T = self._pose.T_map_hand
         data.mocap_quat[self._mocap] = quaternion_from_rotation(T[:3, :3])
-        data.mocap_pos[self._mocap] = T[:3, 3] + np.outer(hand.SIDES, self._pose.opening / 2 * T[:3, 0])
+        data.mocap_pos[self._mocap] = T[:3, 3] + SIDES * (self._pose.opening / 2 * T[:3, 0])
 
     # ------------------------------------------------------------------------------------------------------- the script
 
@@ -126,9 +129,10 @@ class HandDirector:
         turn = float(np.arccos(np.clip((np.trace(T[:3, :3].T @ start.T_map_hand[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
         seconds = max(PEAK * way / speed, PEAK * turn / rate, PEAK * abs(opening - start.opening) / 0.3, DT)
         steps = int(np.ceil(seconds / DT))
+        course = difference(T, start.T_map_hand)
         for k in range(1, steps + 1):
             s = minimum_jerk(k / steps)
-            yield HandPose(interpolate(start.T_map_hand, T, s), start.opening + s * (opening - start.opening))
+            yield HandPose(perturb(start.T_map_hand, s * course), start.opening + s * (opening - start.opening))
 
     # ------------------------------------------------------------------------------------------------------------ carry
 

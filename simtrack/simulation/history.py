@@ -19,33 +19,46 @@ class History:
     """Joint positions and mocap poses at every key; states in between are interpolated.
 
     All that is rendered, scanned or asked of the ground truth goes through `load`, so that all of it agrees exactly.
-    A run needs about ``8 (nq + 7 nmocap)`` bytes a key: 15 MB a minute for the workbench.
+    A run needs about ``8 (nq + 7 nmocap)`` bytes a key: 15 MB a minute for the workbench. With `memory`, the last so
+    many nanoseconds are kept at least, and older keys are forgotten.
     """
 
-    def __init__(self, model: "mujoco.MjModel") -> None:
+    def __init__(self, model: "mujoco.MjModel", memory: int | None = None) -> None:
         import mujoco
 
         self._model = model
+        self._keep = None if memory is None else -(-memory // KEY_NS) + 2
         free = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE] + 3
         ball = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_BALL]
         quaternions = np.concatenate([free, ball]).astype(np.int64)
         mocap = model.nq + 3 * model.nmocap + 4 * np.arange(model.nmocap)
         self._quaternions = np.concatenate([quaternions, mocap])[:, None] + np.arange(4)
-        self._rows = np.empty((_FIRST_CAPACITY, model.nq + 7 * model.nmocap))
+        capacity = _FIRST_CAPACITY if self._keep is None else 2 * self._keep
+        self._rows = np.empty((capacity, model.nq + 7 * model.nmocap))
         self._count = 0
+        self._forgotten = 0
 
     def __len__(self) -> int:
         return self._count
 
     @property
+    def start(self) -> int:
+        """Stamp of the first key that is still known, nanoseconds."""
+        return self._forgotten * KEY_NS
+
+    @property
     def end(self) -> int:
         """Stamp of the last key, nanoseconds."""
-        return (self._count - 1) * KEY_NS
+        return (self._forgotten + self._count - 1) * KEY_NS
+
+    def clear(self) -> None:
+        """Forget everything: the next key is that of stamp 0."""
+        self._count = self._forgotten = 0
 
     def append(self, data: "mujoco.MjData") -> None:
         """Keep the state that `data` is in as the next key."""
         if self._count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+            self._make_room()
         row, previous = self._rows[self._count], self._rows[self._count - 1]
         nq, nmocap = self._model.nq, self._model.nmocap
         row[:nq] = data.qpos
@@ -57,16 +70,24 @@ class History:
             row[self._quaternions[flip]] *= -1.0
         self._count += 1
 
+    def _make_room(self) -> None:
+        if self._keep is None:
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+            return
+        self._rows[: self._keep] = self._rows[self._count - self._keep : self._count]
+        self._forgotten += self._count - self._keep
+        self._count = self._keep
+
     def row(self, stamp: float) -> Float64:
         """(nq + 7 nmocap,) joint positions, mocap positions, mocap quaternions at a stamp in nanoseconds.
 
         Raises:
-            InvalidValueError: before the start or after the last key.
+            InvalidValueError: before the first key that is known, or after the last.
         """
-        if not 0 <= stamp <= self.end:
-            raise InvalidValueError("stamp", stamp, f"0 to {self.end} nanoseconds, what has been simulated so far")
-        index = min(int(stamp // KEY_NS), max(self._count - 2, 0))
-        fraction = (stamp - index * KEY_NS) / KEY_NS
+        if not self.start <= stamp <= self.end:
+            raise InvalidValueError("stamp", stamp, f"{self.start} to {self.end} ns, what was simulated so far")
+        index = min(int(stamp // KEY_NS) - self._forgotten, max(self._count - 2, 0))
+        fraction = (stamp - self.start - index * KEY_NS) / KEY_NS
         if fraction == 0.0:
             return self._rows[index].copy()
         row = (1.0 - fraction) * self._rows[index] + fraction * self._rows[index + 1]

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from mujoco.egl import GLContext
 
 RENDERERS = ("mujoco", "embree")
+NEAR = 0.03
+"""Metres from the eye within which rays hit nothing, as in MuJoCo, so that both show the same."""
 BACKGROUND = (0.62, 0.72, 0.82)
 """Colour of nothing."""
 
@@ -211,6 +213,29 @@ def in_view(model: "mujoco.MjModel", data: "mujoco.MjData", camera: int, half: F
     return (ahead > -reach) & (ahead < far + reach) & (outside < reach[:, None]).all(axis=1)
 
 
+def ray_image(
+    rays: WorldRays, bundle: RayBundle, T_map_camera: Float64, shape: tuple[int, int], out: RayHits | None = None
+) -> Uint8:
+    """(H, W, 3) colour image of the world as `rays` has it: face colours under sun and headlight, without shadows.
+
+    Args:
+        rays: the world, moved to the moment.
+        bundle: rays through the pixel centres.
+        T_map_camera: (4, 4), optical frame.
+        shape: (H, W).
+        out: hits of an earlier image, to be overwritten.
+    """
+    hits = rays.scene.cast(bundle, T_map_camera, np.inf, min_distance=NEAR, out=out)
+    sun = np.array([0.25, 0.35, -1.0]) / np.linalg.norm([0.25, 0.35, -1.0])
+    view = bundle.directions @ T_map_camera[:3, :3].T.astype(np.float32)
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    head = np.abs(np.einsum("ij,ij->i", hits.normals, view))
+    light = 0.38 + 0.24 * head + 0.42 * np.maximum(-(hits.normals @ sun.astype(np.float32)), 0.0)
+    image = np.minimum(rays.colors(hits) * light[:, None], 1.0)
+    image[~hits.hit] = BACKGROUND
+    return np.round(255.0 * image).astype(np.uint8).reshape(*shape, 3)
+
+
 class EmbreeRenderer:
     """Rays through every pixel centre: depth and ids exact, RGB from face colours with diffuse light."""
 
@@ -234,21 +259,15 @@ class EmbreeRenderer:
 
     def rgb(self, data: "mujoco.MjData") -> Uint8:
         """See `Renderer`."""
-        hits = self._cast(data, np.inf)
-        sun = np.array([0.25, 0.35, -1.0]) / np.linalg.norm([0.25, 0.35, -1.0])
-        view = self._bundle.directions @ data.xmat[self._body].reshape(3, 3).T.astype(np.float32)
-        view /= np.linalg.norm(view, axis=1, keepdims=True)
-        head = np.abs(np.einsum("ij,ij->i", hits.normals, view))
-        light = 0.38 + 0.24 * head + 0.42 * np.maximum(-(hits.normals @ sun.astype(np.float32)), 0.0)
-        image = np.minimum(self._rays.colors(hits) * light[:, None], 1.0)
-        image[~hits.hit] = BACKGROUND
-        return np.round(255.0 * image).astype(np.uint8).reshape(*self._shape, 3)
+        self._rays.place(data)
+        return ray_image(self._rays, self._bundle, self._pose(data), self._shape, self._hits)
 
     def _cast(self, data: "mujoco.MjData", far: float) -> RayHits:
         self._rays.place(data)
-        T_map_camera = transform(data.xmat[self._body].reshape(3, 3), data.xpos[self._body])
-        near = 0.03  # as in MuJoCo, so that both show the same
-        return self._rays.scene.cast(self._bundle, T_map_camera, far, min_distance=near, out=self._hits)
+        return self._rays.scene.cast(self._bundle, self._pose(data), far, min_distance=NEAR, out=self._hits)
+
+    def _pose(self, data: "mujoco.MjData") -> Float64:
+        return transform(data.xmat[self._body].reshape(3, 3), data.xpos[self._body])
 
     def close(self) -> None:
         """See `Renderer`; the ray scene belongs to whoever made it."""

@@ -1,10 +1,13 @@
 """The robot as bodies and actuators in MuJoCo, and the controllers that turn a `Command` into actuation."""
 
+import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from simtrack.contracts import Command, Float64
+from simtrack.errors import UnknownNameError
 from simtrack.geometry.kinematics import KinematicTree, Link
 from simtrack.geometry.transforms import quaternion_from_rotation
 from simtrack.objects.tiago import HEAD_PAN, HEAD_TILT, TORSO, TUCKED
@@ -26,6 +29,8 @@ JOINT_ACCELERATION = {TORSO: 0.3, HEAD_PAN: 6.0, HEAD_TILT: 6.0}
 STIFFNESS = {TORSO: (4.0e4, 2.5e3), HEAD_PAN: (250.0, 10.0), HEAD_TILT: (250.0, 10.0)}
 """Position gain and damping of the servos; those of the arm are `ARM_STIFFNESS`."""
 ARM_STIFFNESS = (600.0, 40.0)
+ARM_ACCELERATION, ARM_HASTE = 3.0, 0.5
+"""rad/s^2, and share of the joints' largest speeds, with which the arm reaches: gentle enough for what it holds."""
 BASE_GAIN = (3.0e4, 3.0e4, 3.0e3)
 """N/(m/s) and Nm/(rad/s): the drive holds its speed stiffly, up to `BASE_FORCE`."""
 BASE_FORCE = (400.0, 400.0, 200.0)
@@ -124,14 +129,41 @@ class RobotController:
         self._limits = {joint.name: (joint.lower, joint.upper, joint.max_velocity) for joint in tree.joints}
         self._setpoint = {name: float(start.get(name, TUCKED.get(name, 0.0))) for name in self.joint_names}
         self._rate = dict.fromkeys(JOINT_ACCELERATION, 0.0)
+        self._reaching: dict[str, float] = {}
         self.linear = 0.0
         """Speed of the wheels over ground if they do not slip, m/s."""
         self.angular = 0.0
+
+    @property
+    def setpoints(self) -> dict[str, float]:
+        """Where the servos are asked to be now, radians or metres."""
+        return dict(self._setpoint)
+
+    def reach(self, targets: Mapping[str, float]) -> None:
+        """Let joints of the arm go to targets (radians), each as fast as it may; they hold until other ones come.
+
+        Raises:
+            UnknownNameError: a name is no joint of the arm.
+        """
+        arm = [name for name in self.joint_names if name.startswith("arm_")]
+        if unknown := sorted(set(targets) - set(arm)):
+            raise UnknownNameError("joint of the arm", unknown[0], arm)
+        for name, target in targets.items():
+            lower, upper, _ = self._limits[name]
+            self._reaching[name] = min(max(float(target), lower), upper)
+            self._rate.setdefault(name, 0.0)
 
     def place(self, data: "mujoco.MjData", x: float, y: float, yaw: float) -> None:
         """Put the robot there at rest, with its joints at their setpoints."""
         data.qpos[self._qpos] = (x, y, yaw, *self._setpoint.values())
         data.qvel[self._dof] = 0.0
+        self._write(data)
+
+    def carry(self, data: "mujoco.MjData", x: float, y: float, yaw: float) -> None:
+        """Put the robot there at rest, whatever it was doing; its joints stay as they are."""
+        data.qpos[self._qpos[:3]] = x, y, yaw
+        data.qvel[self._dof[:3]] = 0.0
+        self.linear = self.angular = 0.0
         self._write(data)
 
     def base(self, qpos: Float64) -> tuple[float, float, float]:
@@ -146,8 +178,8 @@ class RobotController:
     def step(self, data: "mujoco.MjData", command: Command) -> None:
         """Set the actuators for one physics step."""
         dt = self.timestep
-        linear = float(np.clip(command.linear, -MAX_LINEAR, MAX_LINEAR))
-        angular = float(np.clip(command.angular, -MAX_ANGULAR, MAX_ANGULAR))
+        linear = min(max(float(command.linear), -MAX_LINEAR), MAX_LINEAR)
+        angular = min(max(float(command.angular), -MAX_ANGULAR), MAX_ANGULAR)
         self.linear = _lagged(self.linear, linear, LINEAR_ACCELERATION, dt)
         self.angular = _lagged(self.angular, angular, ANGULAR_ACCELERATION, dt)
         for name, target in ((TORSO, command.torso), (HEAD_PAN, command.head_pan), (HEAD_TILT, command.head_tilt)):
@@ -156,11 +188,15 @@ class RobotController:
                 self._setpoint[name], self._rate[name], min(max(target, lower), upper), speed,
                 JOINT_ACCELERATION[name], dt,
             )  # fmt: skip
+        for name, target in self._reaching.items():
+            self._setpoint[name], self._rate[name] = _profiled(
+                self._setpoint[name], self._rate[name], target, self._limits[name][2] * ARM_HASTE, ARM_ACCELERATION, dt
+            )
         self._write(data)
 
     def _write(self, data: "mujoco.MjData") -> None:
         yaw = float(data.qpos[self._qpos[2]])
-        speeds = (self.linear * np.cos(yaw), self.linear * np.sin(yaw), self.angular)
+        speeds = (self.linear * math.cos(yaw), self.linear * math.sin(yaw), self.angular)
         data.ctrl[self._actuator] = (*speeds, *self._setpoint.values())
 
 
@@ -175,8 +211,10 @@ def _profiled(
 ) -> tuple[float, float]:
     """Next setpoint and rate of a trapezoidal profile that comes to rest at the target."""
     error = target - position
+    if error == 0.0 == rate:
+        return position, rate
     # The braking parabola, started one step early so that the discrete profile does not overshoot.
-    brake = np.sqrt(2.0 * acceleration * abs(error) + (0.5 * acceleration * dt) ** 2) - 0.5 * acceleration * dt
-    wanted = float(np.copysign(min(max_rate, brake, abs(error) / dt), error))
+    brake = math.sqrt(2.0 * acceleration * abs(error) + (0.5 * acceleration * dt) ** 2) - 0.5 * acceleration * dt
+    wanted = math.copysign(min(max_rate, brake, abs(error) / dt), error)
     rate += min(max(wanted - rate, -acceleration * dt), acceleration * dt)
     return position + rate * dt, rate

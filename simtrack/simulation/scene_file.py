@@ -111,6 +111,8 @@ class RobotSettings(Strict):
     torso: float = Field(default=0.15, ge=0.0, le=0.35)
     head_pan: float = Field(default=0.0, ge=-1.24, le=1.24)
     head_tilt: float = Field(default=-0.4, ge=-0.98, le=0.72)
+    suction: bool = False
+    """Whether the gripper has a suction cup that can hold an object."""
 
 
 class Target(Strict):

@@ -1,6 +1,6 @@
 """The clock: runs physics, hand and robot, and lets every sensor look at its own time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
 from types import TracebackType
@@ -18,9 +18,9 @@ from simtrack.contracts import (
     SensorFrame,
     StaticMap,
 )
-from simtrack.errors import FileFormatError, RenderingError, SimtrackError
+from simtrack.errors import FileFormatError, InvalidValueError, RenderingError, SimtrackError, UnknownNameError
 from simtrack.geometry.kinematics import KinematicTree
-from simtrack.geometry.transforms import rotation_from_rpy, transform
+from simtrack.geometry.transforms import inverse, rotation_from_rpy, transform, transform_planar
 from simtrack.objects import ObjectModel, TrackerModelConfig, tracker_model
 from simtrack.raycast import RayBundle
 from simtrack.sensors.camera import XTION, CameraModel
@@ -33,16 +33,21 @@ from simtrack.simulation.history import KEY_NS, History
 from simtrack.simulation.randomness import stream
 from simtrack.simulation.rendering import make_renderer
 from simtrack.simulation.scene_file import SceneFile
+from simtrack.simulation.settling import rearrange
 from simtrack.simulation.world import SENSOR_BODIES, TIMESTEP_NS, build_world, configured
 from simtrack.simulation.world_rays import WorldRays
 
 if TYPE_CHECKING:
+    import mujoco
+
     from simtrack.sensors.depth_noise import DepthDraws
 
 PROPRIOCEPTION_NS = 20_000_000
-"""Nanoseconds between odometry readings and between joint states: 50 Hz."""
+"""Nanoseconds between odometry readings and between joint states, unless told otherwise: 50 Hz."""
 START_SIGMA = np.array([0.03, 0.03, np.deg2rad(2.0)])
 """How well the robot is told where it starts: standard deviations of x, y, metres, and heading, radians."""
+SENSORS = ("camera", "lidar", "proprioception")
+"""What can look: the RGB-D camera, the lidar, and odometry with the joint encoders."""
 FAR = 10.0
 """Metres beyond which a depth camera of this kind reads nothing, so that nothing is rendered there."""
 
@@ -51,7 +56,7 @@ class Simulation:
     """A world that runs in simulated time and sends sensor frames; a context manager that releases OpenGL at its end.
 
     Every purpose (placement, hand, camera noise, lidar noise, ...) has a random stream of its own, so that rendering or
-    not rendering RGB, say, changes nothing else.
+    not rendering RGB, say, changes nothing else. A sensor that is off draws nothing and costs nothing.
     """
 
     def __init__(
@@ -61,6 +66,13 @@ class Simulation:
         renderer: str = "mujoco",
         camera: CameraModel = XTION,
         lidar: LidarModel = VLP16,
+        *,
+        sensors: Collection[str] = SENSORS,
+        sleep: bool = False,
+        memory: int | None = None,
+        proprioception: int = PROPRIOCEPTION_NS,
+        scan_key: int = KEY_NS,
+        servo: int = TIMESTEP_NS,
     ) -> None:
         """Build the world of `scene` for `seed` and let it settle; stamp 0 is the moment after.
 
@@ -68,39 +80,80 @@ class Simulation:
             scene: from `load_scene`.
             seed: of everything random.
             renderer: ``mujoco`` (falls back to rays, with a warning, where EGL is missing) or ``embree``.
-            camera: the camera in the head.
+            camera: the camera in the head; its rate is also that of `advance`, be it on or off.
             lidar: the lidar on the mast.
+            sensors: which of `SENSORS` are on.
+            sleep: leave things that rest out of the physics until something touches them.
+            memory: nanoseconds of the past that `truth` can be asked about at least; all of it if None.
+            proprioception: nanoseconds between odometry readings and between joint states.
+            scan_key: nanoseconds between the moments of a lidar's turn that its motion is interpolated from.
+            servo: nanoseconds between the setpoints of robot and hand: a physics step, or two.
 
         Raises:
             SimtrackError: whatever is wrong with the scene; see `build_world`.
         """
         import mujoco
 
+        if servo not in (TIMESTEP_NS, KEY_NS):
+            raise InvalidValueError("servo", servo, f"{TIMESTEP_NS} or {KEY_NS} ns")
+        if unknown := sorted(set(sensors) - set(SENSORS)):
+            raise UnknownNameError("sensor", unknown[0], SENSORS)
         self.scene, self.seed = scene, seed
-        self.camera, self.lidar = camera, lidar
+        self._building = seed
+        self.camera, self.lidar, self._sensors = camera, lidar, frozenset(sensors)
+        self._proprioception, self._scan_key, self._servo = proprioception, scan_key, servo
         intrinsics = camera.intrinsics
         fovy = 2.0 * np.arctan(intrinsics.height / (2.0 * intrinsics.fy))
-        self.world = build_world(scene, seed, float(fovy), (intrinsics.width, intrinsics.height))
-        self._configure()
+        self.world = build_world(scene, seed, float(fovy), (intrinsics.width, intrinsics.height), sleep)
         self._data = self.world.data
         self._scratch = mujoco.MjData(self.world.model)
         self._scan_scratch = mujoco.MjData(self.world.model)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="simtrack-sensors")
-        self._history = History(self.world.model)
+        self._history = History(self.world.model, memory)
         self._rays = WorldRays(self.world)
         self.truth = GroundTruth(self.world, self._history, self._rays, intrinsics)
         self._renderer = make_renderer(renderer, self.world, self._rays, intrinsics, FAR)
-        self._hand = HandDirector(self.world, stream(seed, "hand")) if scene.hand is not None else None
         self._lidar_body = self.world.model.body(SENSOR_BODIES["lidar"]).id
         self._T_base_lidar = self.robot.forward({})["lidar"]
         self._shots = lidar.shots()
         self._packing = RayBundle.from_directions(self._shots.directions, self._shots.rings)
-        self._counts: dict[str, int] = dict.fromkeys(("camera", "lidar", "proprioception"), 0)
         self._closed = False
-        self._now = 0
-        self._steps = 0
         self._static_map: StaticMap | None = None
         self._models: dict[str, ObjectModel] | None = None
+        self._begin(seed)
+
+    def restart(self, seed: int) -> None:
+        """Begin anew at stamp 0 with everything random drawn from `seed`, but in the same building.
+
+        The survey and the tracker's models stay, too: they belong to the building and to the catalogue. So the same
+        seed gives the same course of events, whatever was simulated before.
+
+        Args:
+            seed: of places, hand, sensors and start.
+
+        Raises:
+            FileFormatError: there is no room for the things of the scene; see `rearrange`.
+            RenderingError: the simulation is closed.
+        """
+        if self._closed:
+            raise RenderingError("the simulation is closed; make a new one")
+        self._draws.cancel()
+        if not self._draws.cancelled():
+            self._draws.result()
+        rearrange(self.world, seed)
+        self._history.clear()
+        self.truth.clear()
+        self._begin(seed)
+
+    def _begin(self, seed: int) -> None:
+        """What each course of events has for itself, from the settled world on."""
+        self.seed = seed
+        self._configure()
+        self._hand = HandDirector(self.world, stream(seed, "hand")) if self.scene.hand is not None else None
+        self._counts: dict[str, int] = dict.fromkeys(SENSORS, 0)
+        self.world.controller.timestep = self._servo / NANOSECONDS
+        self._now = 0
+        self._T_wheels_map = np.eye(4)
         self._remember()
         self._draws = self._worker.submit(self._draw_noise)
 
@@ -142,7 +195,7 @@ class Simulation:
             from simtrack.simulation.survey import SurveyConfig, survey
 
             config = configured(SurveyConfig, self.scene.survey, self.scene, "survey")
-            self._static_map = survey(self.world.static, config, stream(self.seed, "survey"))
+            self._static_map = survey(self.world.static, config, stream(self._building, "survey"))
         return self._static_map
 
     @property
@@ -152,7 +205,7 @@ class Simulation:
             config = configured(TrackerModelConfig, self.scene.tracker_models, self.scene, "tracker_models")
             exact = {self.world.objects[thing.id].name: self.world.objects[thing.id] for thing in self.scene.objects}
             names = sorted(exact)
-            streams = [stream(self.seed, f"tracker model {name}") for name in names]
+            streams = [stream(self._building, f"tracker model {name}") for name in names]
             with ThreadPoolExecutor() as workers:
                 made = workers.map(tracker_model, (exact[name] for name in names), repeat(config), streams)
                 self._models = dict(zip(names, made, strict=True))
@@ -199,20 +252,40 @@ class Simulation:
         target = self._counts["camera"] * self.camera_period
         while self._history.end < target:
             self._step(command)
-        self._due(PROPRIOCEPTION_NS, "proprioception", target, self._send_proprioception)
+        self._due(self._proprioception, "proprioception", target, self._send_proprioception)
         self._now = target
         # The lidar looks while the camera is rendered, unless both cast rays into the same scene.
         scans = self._worker.submit(self._due, self.lidar.period, "lidar", target - self.lidar.period, self._send_scan)
         if self.renderer != "mujoco":
             scans.result()
-        image = self._take_image(target, want_rgb)
+        if "camera" in self._sensors:
+            self._feed.send(self.calibration.apply(self._take_image(target, want_rgb)), target)
+            self._draws = self._worker.submit(self._draw_noise)
         scans.result()
-        self._feed.send(self.calibration.apply(image), target)
-        self._draws = self._worker.submit(self._draw_noise)
         return self._feed.receive(target)
+
+    def state(self, stamp: int) -> "mujoco.MjData":
+        """Body poses at a stamp, to be read before the next call: for what acts inside of the world."""
+        self._history.load(stamp, self._scratch)
+        return self._scratch
+
+    def carry_robot(self, x: float, y: float, yaw: float) -> None:
+        """Lift the robot and put it down at rest elsewhere, now: its wheels do not feel it (kidnapping).
+
+        Args:
+            x: metres, map.
+            y: metres, map.
+            yaw: radians.
+        """
+        controller = self.world.controller
+        before = transform_planar(*controller.base(self._data.qpos))
+        controller.carry(self._data, x, y, yaw)
+        self._T_wheels_map = self._T_wheels_map @ before @ inverse(transform_planar(x, y, yaw))
 
     def _due(self, period: int, sensor: str, until: int, send: Callable[[int], None]) -> None:
         """Let a sensor look at each of its stamps that has come."""
+        if sensor not in self._sensors:
+            return
         while self._counts[sensor] * period <= until:
             send(self._counts[sensor] * period)
             self._counts[sensor] += 1
@@ -221,11 +294,12 @@ class Simulation:
         """Physics from one key of the history to the next."""
         import mujoco
 
-        for _ in range(KEY_NS // TIMESTEP_NS):
+        steps = self._servo // TIMESTEP_NS
+        for _ in range(KEY_NS // self._servo):
             self.world.controller.step(self._data, command)
             if self._hand is not None:
-                self._hand.step(self._data)
-            mujoco.mj_step(self.world.model, self._data)
+                self._hand.step(self._data, steps)
+            mujoco.mj_step(self.world.model, self._data, nstep=steps)
         self._remember()
 
     def _remember(self) -> None:
@@ -236,10 +310,8 @@ class Simulation:
 
     def _send_proprioception(self, stamp: int) -> None:
         qpos = self._history.qpos(stamp)
-        x, y, yaw = self.world.controller.base(qpos)
-        T_map_base = transform(np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]))
-        T_map_base[:2, 3] = x, y
-        self._feed.send(self._odometry.read(stamp, T_map_base), stamp)
+        T_map_base = transform_planar(*self.world.controller.base(qpos))
+        self._feed.send(self._odometry.read(stamp, self._T_wheels_map @ T_map_base), stamp)
         self._feed.send(self._encoders(qpos, stamp, self._rng_encoders), stamp)
 
     def _encoders(self, qpos: Float64, stamp: int, rng: np.random.Generator) -> JointState:
@@ -249,7 +321,9 @@ class Simulation:
         assert isinstance(reading, JointState)
         return reading
 
-    def _draw_noise(self) -> "DepthDraws":
+    def _draw_noise(self) -> "DepthDraws | None":
+        if "camera" not in self._sensors:
+            return None
         from simtrack.sensors.depth_noise import draw_depth_noise
 
         return draw_depth_noise(self.camera.intrinsics, self.depth_noise, self._rng_depth)
@@ -269,7 +343,7 @@ class Simulation:
 
     def _send_scan(self, stamp: int) -> None:
         """One turn: each shot is cast from where sensor and objects are at its own time."""
-        shots, keys = self._shots, round(self.lidar.period / KEY_NS) + 1
+        shots, keys = self._shots, round(self.lidar.period / self._scan_key) + 1
         poses, sensor = [], np.empty((keys, 4, 4))
         for k in range(keys):
             self._history.load(stamp + k * self.lidar.period / (keys - 1), self._scan_scratch)

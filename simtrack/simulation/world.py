@@ -13,7 +13,7 @@ from simtrack.geometry.kinematics import KinematicTree, Link
 from simtrack.geometry.meshes import Mesh, area, painted
 from simtrack.geometry.transforms import quaternion_from_rotation, transform
 from simtrack.objects import ObjectModel, load_object
-from simtrack.objects.tiago import CAMERA, LIDAR, TUCKED, tiago
+from simtrack.objects.tiago import CAMERA, GRIPPER, LIDAR, tiago
 from simtrack.simulation import hand
 from simtrack.simulation.building.parts import StaticWorld
 from simtrack.simulation.placement import place_objects, start_pose
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 TIMESTEP_NS = 2_000_000
 """Physics step, nanoseconds."""
-SETTLE_SECONDS = 1.5
-"""How long physics lets things come to rest before time 0."""
 
 SHOWN, COLOR_ONLY, DEPTH_ONLY, COLLISION = 0, 1, 2, 3
 """Geom groups: seen always, in RGB images only, in depth and id images only, never."""
@@ -148,7 +146,13 @@ class _Composer:
         return self.spec.compile()
 
 
-def build_world(scene: SceneFile, seed: int, fovy: float = 0.79, image_size: tuple[int, int] = (640, 480)) -> World:
+def build_world(
+    scene: SceneFile,
+    seed: int,
+    fovy: float = 0.79,
+    image_size: tuple[int, int] = (640, 480),
+    sleep: bool = False,
+) -> World:
     """Compose, compile and settle the world of a scene for one seed.
 
     Args:
@@ -156,11 +160,14 @@ def build_world(scene: SceneFile, seed: int, fovy: float = 0.79, image_size: tup
         seed: of the run; places, building and start are drawn from it.
         fovy: vertical field of view of the robot's camera, radians.
         image_size: width and height of the largest image to be rendered.
+        sleep: leave things that rest out of the physics until something touches them.
 
     Raises:
         FileFormatError: the scene names things that do not exist, has no room for them, or its MJCF is broken.
         UnknownNameError: an object that is not in the catalogue; lists those that are.
     """
+    from simtrack.simulation.settling import settle
+
     static = build_static(scene, seed)
     models = _models(scene)
     start = start_pose(scene, static, stream(seed, "start"))
@@ -168,7 +175,7 @@ def build_world(scene: SceneFile, seed: int, fovy: float = 0.79, image_size: tup
     robot = tiago()
 
     composer = _Composer()
-    _set_options(composer.spec, image_size)
+    _set_options(composer.spec, image_size, sleep)
     if scene.static.builder == "mjcf":
         from simtrack.simulation.mjcf_world import floor_height
         from simtrack.simulation.user_mjcf import attach
@@ -184,10 +191,13 @@ def build_world(scene: SceneFile, seed: int, fovy: float = 0.79, image_size: tup
         trackable = any(thing.id == name for thing in scene.objects)
         _add_object(composer, name, model, poses[name], "catalogue" if trackable else "clutter")
     _add_robot(composer, robot, fovy)
+    if scene.robot.suction:
+        _add_suction(composer, models)
     if scene.hand is not None:
         _add_hand(composer, scene)
-    model = composer.finish()
-    return _settled(scene, seed, model, static, robot, models, poses, start, composer)
+    world = _assembled(scene, seed, composer, static, robot, models)
+    settle(world, poses, start)
+    return world
 
 
 def build_static(scene: SceneFile, seed: int) -> StaticWorld:
@@ -259,9 +269,11 @@ def _models(scene: SceneFile) -> dict[str, ObjectModel]:
     return models
 
 
-def _set_options(spec: "mujoco.MjSpec", image_size: tuple[int, int]) -> None:
+def _set_options(spec: "mujoco.MjSpec", image_size: tuple[int, int], sleep: bool) -> None:
     import mujoco
 
+    if sleep:
+        spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
     spec.compiler.degree = False
     spec.option.timestep = TIMESTEP_NS * 1e-9
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -354,6 +366,17 @@ def _add_robot(composer: _Composer, robot: KinematicTree, fovy: float) -> None:
     camera.fovy = float(np.degrees(fovy))
 
 
+def _add_suction(composer: _Composer, models: Mapping[str, ObjectModel]) -> None:
+    """A constraint for each object that ties it to the gripper while the cup holds it."""
+    import mujoco
+
+    for name in models:
+        composer.spec.add_equality(
+            name=f"suction/{name}", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1=ROBOT + GRIPPER, name2=f"object/{name}", active=False, solref=[0.012, 1.0],
+        )  # fmt: skip
+
+
 def _add_hand(composer: _Composer, scene: SceneFile) -> None:
     import mujoco
 
@@ -380,42 +403,21 @@ def _add_hand(composer: _Composer, scene: SceneFile) -> None:
         )  # fmt: skip
 
 
-def _settled(
+def _assembled(
     scene: SceneFile,
     seed: int,
-    model: "mujoco.MjModel",
+    composer: _Composer,
     static: StaticWorld,
     robot: KinematicTree,
     models: dict[str, ObjectModel],
-    poses: dict[str, Float64],
-    start: tuple[float, float, float],
-    composer: _Composer,
 ) -> World:
-    """Let physics bring everything to rest and check that it rests where it was put."""
+    """The compiled world before physics has begun."""
     import mujoco
 
-    data = mujoco.MjData(model)
-    joints = {
-        "torso_lift_joint": scene.robot.torso,
-        "head_1_joint": scene.robot.head_pan,
-        "head_2_joint": scene.robot.head_tilt,
-    }
-    controller = RobotController(model, robot, {**TUCKED, **joints}, TIMESTEP_NS * 1e-9)
-    controller.place(data, *start)
-    mujoco.mj_step(model, data, nstep=round(SETTLE_SECONDS / (TIMESTEP_NS * 1e-9)))
-    controller.place(data, *start)
-    data.qvel[:] = 0.0
-    data.time = 0.0
-    mujoco.mj_forward(model, data)
+    from simtrack.simulation.settling import standing
 
+    model = composer.finish()
     bodies = {name: model.body(f"object/{name}").id for name in models}
-    things = {thing.id: f"objects.{k}" for k, thing in enumerate(scene.objects)}
-    things |= {thing.id: f"clutter.{k}" for k, thing in enumerate(scene.clutter)}
-    for name, body in bodies.items():
-        moved = float(np.linalg.norm(data.xpos[body] - poses[name][:3, 3]))
-        if not moved < 0.05:
-            reason = f"'{name}' does not rest where it is put: it moved by {moved:.2f} m while settling"
-            raise FileFormatError(scene.path, f"{things[name]}.place", reason)
     bodies["robot"] = model.body(ROBOT + "base").id
     if scene.hand is not None:
         bodies["hand"] = model.body(hand.PARTS[0]).id
@@ -424,6 +426,7 @@ def _settled(
     )
     names = tuple(dict.fromkeys(instance.name for instance in instances))
     owners = _geom_owners(model, instances, names)
+    data, controller = mujoco.MjData(model), standing(scene, model, robot)
     return World(scene, seed, model, data, static, robot, controller, models, instances, names, owners, bodies)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from simtrack.contracts import Float32, Float64, Int32
 from simtrack.geometry.meshes import concatenate, transformed
 from simtrack.raycast import RayHits, RayScene, TriangleMesh
-from simtrack.simulation.world import World, body_pose
+from simtrack.simulation.world import World
 
 if TYPE_CHECKING:
     import mujoco
@@ -61,8 +61,7 @@ class WorldRays:
 
     def place(self, data: "mujoco.MjData") -> None:
         """Move everything to where it is in `data`."""
-        for number, instance in enumerate(self.moving, self._first):
-            self.scene.set_pose(number, body_pose(data, instance.body) @ instance.T_body_mesh)
+        self.scene.set_poses(range(self._first, self._first + len(self.moving)), self.poses(data))
 
     def poses(self, data: "mujoco.MjData") -> Float64:
         """(I, 4, 4) T_map_mesh of what moves, in the order of `moving`."""

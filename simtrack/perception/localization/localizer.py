@@ -84,6 +84,11 @@ class MeshLocalizer:
         """The map sliced for searching, made at first use."""
         return build_search_map(self.surface.static_map, self.config.search, self.surface.floor)
 
+    def share_search_map(self, other: "MeshLocalizer") -> None:
+        """Search the slices that another localizer has made of the same map, if it has made them."""
+        if "search_map" in vars(other):
+            vars(self)["search_map"] = other.search_map
+
     # ------------------------------------------------------------------------------------------------------- feeding
 
     def initialise(self, stamp: int, T_map_base: Float64, covariance: Float64 | None = None) -> None:

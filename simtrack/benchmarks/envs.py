@@ -1,0 +1,109 @@
+"""``simtrack bench envs``: steps a second of the environments by observation mode, and what a step is spent on.
+
+A step is a tenth of a second: 50 steps of physics. CPU time counts, because machines are shared. Physics is
+the same simulation with all sensors off, sensing what the sensors add to it, and the rest of a step is perception (the
+stack, or ideal perception), reward and arrays.
+"""
+
+import statistics
+import time
+from collections.abc import Sequence
+
+import gymnasium as gym
+import numpy as np
+
+from simtrack.benchmarks.harness import Benchmark, Options, Timing
+from simtrack.benchmarks.yardstick import REFERENCE, scaled, yardstick
+from simtrack.contracts import Float32
+from simtrack.envs.loop import BUILDING_SEED, MEMORY, SCAN_KEY
+from simtrack.envs.policies import make_policy
+from simtrack.envs.wrappers import simtrack_env
+from simtrack.simulation.history import KEY_NS
+from simtrack.simulation.simulation import Simulation
+
+ASKED = {"state": 150.0, "belief": 60.0, "rgbd": 80.0}
+"""Steps a second on one core, of a machine on which the yardstick takes `REFERENCE`."""
+WARM_UP = 30
+"""Steps that do not count: kernels are loaded, objects are born."""
+
+
+def run(options: Options) -> Benchmark:
+    """Measure; see the module."""
+    result = Benchmark("envs")
+    steps = 30 if options.quick else 200
+    pace = scaled(1.0, yardstick(options.say))
+    names = ("ActivePerception",) if options.quick else ("ActivePerception", "Localize")
+    for name in names:
+        for mode, asked in ASKED.items():
+            options.say(f"{name}, {mode}")
+            _measure(result, f"simtrack/{name}-v0", name, mode, asked / pace, steps, options.seed)
+    result.notes.append(
+        f"asked are {', '.join(f'{rate:g} ({mode})' for mode, rate in ASKED.items())} where the yardstick (embreex, "
+        f"640x480 rays) takes {1e3 * REFERENCE:g} ms; here it took {1e3 * REFERENCE * pace:.0f} ms, and that much less "
+        "is asked"
+    )
+    result.notes.append("actions are those of the scripted policy fed with what the mode shows, random ones for rgbd")
+    return result
+
+
+def _measure(result: Benchmark, env_id: str, name: str, mode: str, asked: float, steps: int, seed: int) -> None:
+    env = gym.make(env_id, observation=mode, disable_env_checker=True)
+    try:
+        whole, actions = _play(env, mode, steps, seed)
+        sensing = _simulate(env, actions, seed, on=True)
+        physics = _simulate(env, actions, seed, on=False)
+    finally:
+        env.close()
+    prefix = f"{name}, {mode}"
+    result.add(
+        f"{prefix}: steps a second", whole, 1.0 / whole.cpu, unit="1/s CPU", asked=asked, sense="at least",
+        note=f"median of {steps} steps",
+    )  # fmt: skip
+    result.add(f"{prefix}: physics", value=1e3 * physics, unit="ms CPU")
+    result.add(f"{prefix}: sensors and rendering", value=1e3 * (sensing - physics), unit="ms CPU")
+    result.add(f"{prefix}: perception, reward, arrays", value=1e3 * (whole.cpu - sensing), unit="ms CPU")
+
+
+def _play(env: gym.Env, mode: str, steps: int, seed: int) -> tuple[Timing, list[Float32]]:
+    """CPU and wall time of a step, and the actions that were taken; choosing them does not count."""
+    inner = simtrack_env(env)
+    observation, _ = env.reset(seed=seed)
+    scripted = mode in ("belief", "state")
+    policy = make_policy(
+        "scripted" if scripted else "random", inner.task_name, inner.briefing(), len(inner.steering.towards(
+            inner.steering.start)), mode if scripted else "belief",
+    )  # fmt: skip
+    policy.begin(np.random.default_rng(seed))
+    cpu, wall, actions = [], [], []
+    for _ in range(WARM_UP + steps):
+        actions.append(policy.act(observation))
+        started, clock = time.process_time(), time.perf_counter()
+        observation, _, terminated, truncated, _ = env.step(actions[-1])
+        cpu.append(time.process_time() - started)
+        wall.append(time.perf_counter() - clock)
+        if terminated or truncated:
+            observation, _ = env.reset(seed=seed)
+            policy.begin(np.random.default_rng(seed))
+    return Timing(statistics.median(cpu[WARM_UP:]), statistics.median(wall[WARM_UP:]), steps), actions
+
+
+def _simulate(env: gym.Env, actions: Sequence[Float32], seed: int, on: bool) -> float:
+    """Median CPU seconds of the simulation alone under the same actions, its sensors on or off."""
+    inner = simtrack_env(env)
+    settings, steering = inner.settings, inner.steering
+    sensors = settings.sensors if on else ()
+    colours = on and "rgbd" in settings.modes
+    steering.reset()
+    times = []
+    with Simulation(
+        inner.scene, BUILDING_SEED, settings.renderer, settings.camera, settings.lidar,
+        sensors=sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
+        scan_key=SCAN_KEY, servo=KEY_NS,
+    ) as simulation:  # fmt: skip
+        simulation.restart(seed)
+        for action in actions:
+            command = steering.apply(action)
+            started = time.process_time()
+            simulation.advance(command, want_rgb=colours)
+            times.append(time.process_time() - started)
+    return statistics.median(times[WARM_UP:])

@@ -1,0 +1,95 @@
+"""``simtrack env``: let a policy play an environment."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+
+def env(
+    env_id: Annotated[str, tyro.conf.Positional],
+    policy: Literal["scripted", "random", "still"] = "scripted",
+    episodes: int = 1,
+    seed: int = 0,
+    observation: tuple[str, ...] = ("belief",),
+    feed: Literal["belief", "state"] = "belief",
+    seconds: float | None = None,
+    miss_rate: float | None = None,
+    keypoint_error: float | None = None,
+    video: Path | None = None,
+    record: Path | None = None,
+    json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
+    threads: int = 1,
+) -> int:
+    """Let a policy play an environment, and tell how well it did.
+
+    Args:
+        env_id: Id of the environment, e.g. ActivePerception or simtrack/ActivePerception-v0.
+        policy: What acts.
+        episodes: How many are played; episode k has the seed SEED + k.
+        seed: Of the first episode.
+        observation: Observation modes: belief, state, rgbd.
+        feed: What a scripted policy sees: what is believed, or the truth (which must then be observed, too).
+        seconds: Length of an episode; the task's own if not given.
+        miss_rate: Share of visible objects that the detector does not find; the oracle's own if not given.
+        keypoint_error: Median error of the detector's keypoints as a share of the object's size.
+        video: Write a video of all episodes to this file.
+        record: Write an MCAP log of each episode to this folder.
+        json_file: Write the figures of each episode to this file.
+        threads: Threads of the compiled kernels.
+    """
+    import gymnasium as gym
+
+    from simtrack.cli import console
+    from simtrack.envs.play import play
+    from simtrack.envs.wrappers import Recorder, Video
+    from simtrack.errors import InvalidValueError
+    from simtrack.evaluation.closed_loop import set_threads
+
+    if episodes < 1:
+        raise InvalidValueError("episodes", episodes, "1 or more")
+    set_threads(threads)
+    errors = {"miss_rate": miss_rate, "keypoint_error": keypoint_error}
+    arguments: dict[str, Any] = {
+        "observation": observation[0] if len(observation) == 1 else observation,
+        "seconds": seconds,
+        "detector_errors": {name: value for name, value in errors.items() if value is not None},
+    }
+    made: gym.Env = gym.make(full_id(env_id), disable_env_checker=True, **arguments)
+    if video is not None:
+        made = Video(made, video)
+    if record is not None:
+        made = Recorder(made, record)
+    with made:
+        results = []
+        for result in play(made, policy, range(seed, seed + episodes), feed):
+            print(
+                f"seed {result.seed}: return {result.total:.2f}, {'success' if result.success else 'no success'}, "
+                + ", ".join(f"{name} {value:.3g}" for name, value in result.metrics.items()),
+                flush=True,
+            )
+            results.append(result)
+    names = list(results[0].metrics)
+    mean = {name: sum(r.metrics[name] for r in results) / episodes for name in names}
+    rows = [("success", f"{sum(r.success for r in results)}/{episodes}")]
+    rows += [("return", f"{sum(r.total for r in results) / episodes:.3f}")]
+    rows += [(name, f"{value:.4g}") for name, value in mean.items()]
+    console.show_table(("mean over episodes", "value"), rows, right=(1,))
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps([result.plain() for result in results], indent=1) + "\n")
+    return 0
+
+
+def full_id(name: str) -> str:
+    """The registered id that a name stands for; raises UnknownNameError with the known ones."""
+    import gymnasium as gym
+
+    from simtrack.errors import UnknownNameError
+
+    known = [spec for spec in gym.registry if spec.startswith("simtrack/")]
+    for candidate in (name, f"simtrack/{name}", f"simtrack/{name}-v0"):
+        if candidate in known:
+            return candidate
+    raise UnknownNameError("environment", name, known)

@@ -1,0 +1,126 @@
+"""Where the arm can bring the suction cup: inverse kinematics by damped least squares."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from simtrack.contracts import Float64
+from simtrack.geometry.kinematics import Joint, KinematicTree
+from simtrack.geometry.transforms import transform
+from simtrack.objects.tiago import GRIPPER, TORSO, TUCKED
+from simtrack.simulation.suction import CUP
+
+SHOULDER = 0.138
+"""Metres from the base's centre to the arm's first axis, along x."""
+ARM = tuple(f"arm_{k}_joint" for k in range(1, 8))
+READY: Mapping[str, float] = {
+    "arm_1_joint": 0.0, "arm_2_joint": -1.05, "arm_3_joint": 0.0, "arm_4_joint": 1.5, "arm_5_joint": 0.0,
+    "arm_6_joint": 1.12, "arm_7_joint": 0.0,
+}  # fmt: skip
+"""Posture before the chest, above tables, with the cup pointing down: the search for joint angles begins here."""
+ASIDE: Mapping[str, float] = {**READY, "arm_1_joint": -1.57}
+"""The same beside the robot: on the way from the tucked posture, over the edge of a table."""
+
+
+@dataclass(frozen=True, slots=True)
+class IkConfig:
+    """How joint angles are sought."""
+
+    iterations: int = 60
+    damping: float = 0.03
+    """Of the least squares: large where the arm is stretched."""
+    translation: float = 5e-4
+    """Metres: near enough."""
+    tilt: float = np.deg2rad(1.0)
+    """Radians off the wanted direction: near enough."""
+    step: float = 0.25
+    """Largest change of a joint an iteration, radians."""
+    posture: float = 0.02
+    """How strongly free motion is drawn to the posture that the search began with."""
+
+
+class ArmKinematics:
+    """The arm of a robot, from its own description."""
+
+    def __init__(self, robot: KinematicTree, config: IkConfig | None = None) -> None:
+        self.config = config or IkConfig()
+        links = {link.name: link for link in robot.links}
+        chain, name = [], GRIPPER
+        while links[name].parent:
+            chain.append(links[name])
+            name = links[name].parent
+        self._tree = KinematicTree((links[name], *reversed(chain)))
+        joints: dict[str, Joint] = {joint.name: joint for joint in self._tree.joints}
+        self._links = [next(link for link in chain if link.joint is joints[name]) for name in ARM]
+        self._low = np.array([joints[name].lower for name in ARM])
+        self._high = np.array([joints[name].upper for name in ARM])
+
+    def cup(self, joints: Mapping[str, float]) -> Float64:
+        """(4, 4) T_base_cup: origin in the cup's rim, x in the direction of sucking."""
+        return self._tree.forward(joints)[GRIPPER] @ transform(translation=(CUP[0], CUP[1], CUP[2]))
+
+    def solve(
+        self, position: Float64, torso: float, start: Mapping[str, float] = READY, yaw: float | None = None
+    ) -> dict[str, float] | None:
+        """Joint angles that bring the cup to a place, pointing straight down.
+
+        Args:
+            position: (3,), of the rim, base frame, metres.
+            torso: lift, metres.
+            start: joint angles, radians, to begin with; the answer is one near them.
+            yaw: heading of the cup's y axis about the vertical, radians, base frame; any if None.
+
+        Returns:
+            Joint name -> radians, or None if the place is out of reach.
+        """
+        config = self.config
+        q = np.array([start.get(name, TUCKED[name]) for name in ARM])
+        if start is READY:  # turned towards the place, which is where most answers lie
+            q[0] = np.arctan2(position[1], position[0] - SHOULDER)
+            wrist = 0.0 if yaw is None else q[0] + np.pi / 2 - yaw  # the cup's y axis points to the left in READY
+            q[6] = np.arctan2(np.sin(wrist), np.cos(wrist))
+            q = np.clip(q, self._low, self._high)
+        home = q.copy()
+        for _ in range(config.iterations):
+            pose, J = self._linearised(q, torso)
+            error, close = self._error(pose, position, yaw)
+            if close:
+                return dict(zip(ARM, q.tolist(), strict=True))
+            J = J if yaw is not None else J[: len(error)]
+            JJ = J @ J.T + config.damping**2 * np.eye(len(J))
+            change = J.T @ np.linalg.solve(JJ, error)
+            free = np.eye(len(q)) - J.T @ np.linalg.solve(JJ, J)
+            change += config.posture * free @ (home - q)
+            change *= min(1.0, config.step / max(float(np.abs(change).max()), 1e-9))
+            q = np.clip(q + change, self._low, self._high)
+        return None
+
+    def _error(self, pose: Float64, position: Float64, yaw: float | None) -> tuple[Float64, bool]:
+        """What is missing: metres, tilt about x and y, and, if asked for, turn about z; and whether it is little."""
+        gap = position - pose[:3, 3]
+        axis = pose[:3, 0]
+        tilt = np.cross(axis, [0.0, 0.0, -1.0])
+        if axis[2] > 0.0:  # pointing up: any way round
+            tilt = tilt / max(float(np.linalg.norm(tilt)), 1e-6)
+        error = [*gap, tilt[0], tilt[1]]
+        close = float(np.linalg.norm(gap)) < self.config.translation
+        close &= axis[2] < 0.0 and float(np.hypot(tilt[0], tilt[1])) < self.config.tilt
+        if yaw is not None:
+            turn = yaw - float(np.arctan2(pose[1, 1], pose[0, 1]))
+            turn = float(np.arctan2(np.sin(turn), np.cos(turn)))
+            error.append(turn)
+            close &= abs(turn) < 2.0 * self.config.tilt
+        return np.array(error), bool(close)
+
+    def _linearised(self, q: Float64, torso: float) -> tuple[Float64, Float64]:
+        """The cup's pose and its (6, 7) Jacobian: translation, then rotation, base frame."""
+        poses = self._tree.forward({TORSO: torso, **dict(zip(ARM, q.tolist(), strict=True))})
+        cup = poses[GRIPPER] @ transform(translation=(CUP[0], CUP[1], CUP[2]))
+        J = np.empty((6, len(q)))
+        for k, link in enumerate(self._links):
+            assert link.joint is not None
+            axis = poses[link.name][:3, :3] @ link.joint.axis
+            J[:3, k] = np.cross(axis, cup[:3, 3] - poses[link.name][:3, 3])
+            J[3:, k] = axis
+        return cup, J

@@ -1,0 +1,145 @@
+"""The world, the robot's sensors and what is made of them, one control step at a time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from simtrack.contracts import Belief, Command, DetectionResult, JointState, Odometry, RgbdFrame, SensorFrame
+from simtrack.envs.observations import Proprioception
+from simtrack.envs.resolution import noise_in_small_images, stack_config
+from simtrack.envs.settings import CONTROL_NS, Settings, pixel_scale
+from simtrack.envs.truth import IdealPerception, true_belief
+from simtrack.perception.localization import MeshLocalizer
+from simtrack.perception.pipeline import PerceptionStack
+from simtrack.sensors.depth_noise import PRESETS
+from simtrack.simulation.ground_truth import Truth
+from simtrack.simulation.history import KEY_NS
+from simtrack.simulation.oracles import OracleDetector
+from simtrack.simulation.scene_file import SceneFile
+from simtrack.simulation.simulation import Simulation
+
+BUILDING_SEED = 0
+"""Decides what belongs to the building and not to an episode: the survey, and how the tracker's models are off."""
+SCAN_KEY = 20_000_000
+"""Nanoseconds between the moments of a lidar's turn: at 2 m/s^2 a straight line between them errs by 0.1 mm."""
+MEMORY = 2_000_000_000
+"""Nanoseconds of the past that are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """What there is to know after a step."""
+
+    truth: Truth
+    belief: Belief
+    """What the robot believes: the stack's answer, or that of ideal perception where no stack runs."""
+    state: Belief | None
+    """The truth in the same shape, where it is observed."""
+    felt: Proprioception
+    image: RgbdFrame | None
+    """The camera's image, where there is one."""
+    feed: tuple[SensorFrame | DetectionResult, ...] = ()
+    """What arrived since the last step: sensor frames, and the detector's answers after the images they belong to."""
+
+
+class Loop:
+    """Simulation and perception of an environment; built once, begun anew for every episode.
+
+    Only what the settings ask for is simulated: without images and beliefs there is no camera, no lidar, no stack.
+    """
+
+    def __init__(self, scene: SceneFile, settings: Settings) -> None:
+        """Build the world; raises SimtrackError for a scene that cannot be built."""
+        self._settings = settings
+        camera = settings.camera
+        scene = _with_noise(scene, pixel_scale(camera))
+        self.simulation = Simulation(
+            scene, BUILDING_SEED, settings.renderer, camera, settings.lidar,
+            sensors=settings.sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
+            scan_key=SCAN_KEY, servo=KEY_NS,
+        )  # fmt: skip
+        self._ideal = IdealPerception(self.simulation, camera)
+        self._stack: PerceptionStack | None = None
+        self._felt = Proprioception(JointState(0, (), np.zeros(0)), 0.0, 0.0)
+        self._image: RgbdFrame | None = None
+        self._belief: Belief | None = None
+        self._feed: list[SensorFrame | DetectionResult] = []
+
+    @property
+    def has_stack(self) -> bool:
+        """Whether a stack makes the beliefs."""
+        return "belief" in self._settings.modes
+
+    def restart(self, seed: int) -> None:
+        """Begin an episode; everything random is drawn from `seed`."""
+        simulation = self.simulation
+        simulation.restart(seed)
+        self._ideal.reset()
+        self._belief = self._image = None
+        if self.has_stack:
+            old, self._stack = self._stack, self._make_stack(seed)
+            if old is not None:
+                if isinstance(old.localizer, MeshLocalizer) and isinstance(self._stack.localizer, MeshLocalizer):
+                    self._stack.localizer.share_search_map(old.localizer)
+                old.close()
+            self._stack.on_detection = self._feed.append
+
+    def _make_stack(self, seed: int) -> PerceptionStack:
+        simulation = self.simulation
+        errors = self._settings.detector_config(pixel_scale(simulation.camera))
+        return PerceptionStack(
+            simulation.static_map,
+            simulation.models,
+            simulation.robot,
+            OracleDetector(simulation.truth, simulation.models, seed, errors),
+            T_map_base=simulation.start,
+            config=stack_config(pixel_scale(simulation.camera)),
+        )
+
+    def step(self, command: Command) -> Snapshot:
+        """Run for one control step under a command."""
+        simulation, colours = self.simulation, "rgbd" in self._settings.modes
+        if self._stack is not None:
+            colours = colours or self._stack.wants_image(simulation.now + CONTROL_NS)
+        self._feed.clear()
+        for frame in simulation.advance(command, want_rgb=colours):
+            self._feed.append(frame)
+            if isinstance(frame, JointState):
+                self._felt = Proprioception(frame, self._felt.linear, self._felt.angular)
+            elif isinstance(frame, Odometry):
+                self._felt = Proprioception(self._felt.joints, frame.linear, frame.angular)
+            elif isinstance(frame, RgbdFrame):
+                self._image = frame
+            if self._stack is not None:
+                self._belief = self._stack.process(frame) or self._belief
+        return self._snapshot()
+
+    def _snapshot(self) -> Snapshot:
+        truth = self.simulation.truth.at(self.simulation.now)
+        state = belief = None
+        if self._stack is None or "state" in self._settings.modes:
+            visible = self._ideal.visible(truth)
+            state = true_belief(truth, visible) if "state" in self._settings.modes else None
+            belief = self._ideal.process(truth, visible) if self._stack is None else None
+        belief = belief or self._belief
+        assert belief is not None
+        return Snapshot(truth, belief, state, self._felt, self._image, tuple(self._feed))
+
+    def _end_stack(self) -> None:
+        if self._stack is not None:
+            self._stack.close()
+            self._stack = None
+
+    def close(self) -> None:
+        """Release everything; may be called twice."""
+        self._end_stack()
+        self.simulation.close()
+
+
+def _with_noise(scene: SceneFile, scale: float) -> SceneFile:
+    """The scene with its depth noise as it looks in images `scale` times as large; what the scene says stays."""
+    sensors = scene.sensors
+    if sensors.depth not in PRESETS:  # which the simulation will refuse
+        return scene
+    noise = {**noise_in_small_images(sensors.depth, scale), **sensors.depth_noise}
+    return scene.model_copy(update={"sensors": sensors.model_copy(update={"depth_noise": noise})})
