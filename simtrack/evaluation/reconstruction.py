@@ -28,7 +28,7 @@ WELL_SEEN = 0.6
 """Share of the surface that can be seen at all from which a thing's yaw and height are asked for."""
 UP, YAW, HEIGHT = np.radians(15.0), np.radians(15.0), 0.1
 """Radians, radians, share: errors up to which up-axis, yaw and height count as right."""
-SEEN_SHARES = ((0.6, 1.01), (0.3, 0.6), (0.0, 0.3))
+SEEN_SHARES = ((WELL_SEEN, 1.01), (0.3, WELL_SEEN), (0.0, 0.3))
 """Ranges of the same share in which errors are told apart."""
 
 
