@@ -32,8 +32,8 @@ def check(
     from simtrack.plausibility.check import RESULTS, check_urdf
     from simtrack.plausibility.verdict import CheckConfig
 
-    folder = out if out is not None else Path("runs") / f"check-{file.stem}"
-    with console.ProgressLine(f"check of {file.name}", "settling in both engines"):
+    folder = out if out is not None else Path("runs") / f"check-{file.stem or file.resolve().name}"
+    with console.ProgressLine(f"check of {file}", "settling in both engines"):
         report = check_urdf(file, root=root, out=folder, config=CheckConfig(duration=duration), time_limit=time_limit)
     show(report)
     console.show_written(folder, [name for name in RESULTS if (folder / name).is_file()])

@@ -36,8 +36,8 @@ def reconstruct(
     Args:
         source: A scene such as rooms:7 or kitchen:3 (see `simtrack scenes`), or the folder of a run.
         out: Folder for the results; runs/reconstruct-SOURCE if not given.
-        entities: true meshes, partial ones as a camera sees them on a walk, or tracked ones of a run; the default is
-            tracked for a run and true for a scene.
+        entities: Whole meshes (true), partial ones as seen on a walk, or tracked ones of a run, for which that is the
+            default, as true is for scenes.
         seed: Of the scene if its name fixes none, and of the walk.
         overwrite: Replace the results in an existing folder.
         time_limit: Seconds that each engine of the check may take.

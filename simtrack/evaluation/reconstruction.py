@@ -25,11 +25,11 @@ from simtrack.simulation.building.rooms.physics import RoomEntity, SettledRoom
 Entities: TypeAlias = Literal["true", "partial"]
 ENTITIES: tuple[Entities, ...] = ("true", "partial")
 WELL_SEEN = 0.6
-"""Share of a thing's surface from which its yaw and its height are asked for."""
+"""Share of the surface that can be seen at all from which a thing's yaw and height are asked for."""
 UP, YAW, HEIGHT = np.radians(15.0), np.radians(15.0), 0.1
 """Radians, radians, share: errors up to which up-axis, yaw and height count as right."""
-SEEN_SHARES = ((0.6, 1.01), (0.3, 0.6), (0.0, 0.3))
-"""Ranges of the share of the surface that was seen in which errors are told apart."""
+SEEN_SHARES = ((WELL_SEEN, 1.01), (0.3, WELL_SEEN), (0.0, 0.3))
+"""Ranges of the same share in which errors are told apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class ModelOutcome:
     name: str
     semantic_class: str
     seen: float
-    """Share of its surface that the entity mesh covers."""
+    """Share that the entity mesh covers of the surface that can be seen from outside at all (`visible_faces`)."""
     model: str
     kept: bool
     """Whether the model is one of its class, not its own mesh."""

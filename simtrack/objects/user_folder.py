@@ -211,7 +211,7 @@ def _build(specification: ObjectSpecification, mesh: Mesh, path: Path) -> Object
         semantic_class=specification.semantic_class,
         mesh=mesh,
         visual=meshes.decimate(mesh, MAX_VISUAL_FACES),
-        collision=collision_parts(specification.collision, mesh, path),
+        collision=_collision_parts(specification.collision, mesh, path),
         mass=mass,
         friction=specification.friction,
         symmetries=_symmetries(specification, mesh.bounds.mean(axis=0)),
@@ -221,7 +221,7 @@ def _build(specification: ObjectSpecification, mesh: Mesh, path: Path) -> Object
     )
 
 
-def collision_parts(kind: str, mesh: Mesh, path: Path) -> list[Mesh]:
+def _collision_parts(kind: str, mesh: Mesh, path: Path) -> list[Mesh]:
     """Convex pieces that stand for a mesh in physics; `kind` as `ObjectSpecification.collision`, `path` for errors."""
     if kind == "box":
         return [meshes.transformed(meshes.box_mesh(mesh.extents), transform(translation=mesh.bounds.mean(axis=0)))]

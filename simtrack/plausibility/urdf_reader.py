@@ -70,7 +70,7 @@ class UrdfReader:
 
     def _parse(self) -> Element:
         if not self.path.is_file():
-            raise self._error("", "no such file")
+            raise self._error("", "is a folder; give the URDF file" if self.path.is_dir() else "no such file")
         if self.path.stat().st_size > MAX_BYTES:
             raise self._error("", f"is larger than {MAX_BYTES} bytes")
         content = self.path.read_bytes()
@@ -120,8 +120,8 @@ class UrdfReader:
             children.setdefault(parent, []).append(child)
         roots = [name for name in links if name not in joint_of]
         if len(roots) != 1:
-            listing = ", ".join(roots[:5]) or "none: the joints form a cycle"
-            raise self._error("link", f"one link must have no parent; these have none: {listing}")
+            found = f"these have none: {', '.join(roots[:5])}" if roots else "all have one: the joints form a cycle"
+            raise self._error("link", f"one link must have no parent; {found}")
         order = list(roots)
         for name in order:
             order.extend(children.get(name, ()))

@@ -276,6 +276,8 @@ def load_scene(name_or_path: str | Path) -> SceneFile:
         from simtrack.simulation.mjcf_world import mjcf_scene
 
         return mjcf_scene(path)
+    if path.suffix in (".yaml", ".yml", ".xml"):
+        raise FileFormatError(path, "", "no such file")
     if len(path.parts) > 1 and (path / FILE_NAME).is_file():
         return read_scene(path / FILE_NAME)
     known = scene_names()

@@ -33,6 +33,12 @@ def test_unknown_scene_lists_the_known() -> None:
         load_scene("workbenhc")
 
 
+@pytest.mark.parametrize("name", ["rooms/scene.xml", "scene.yaml"])
+def test_a_missing_file_is_no_unknown_scene(name: str, tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="no such file"):
+        load_scene(tmp_path / name)
+
+
 def test_users_folder_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "workbench"
     folder.mkdir()
@@ -47,7 +53,7 @@ def test_users_folder_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     ("where", "value", "message"),
     [
         ("colour", "red", r"unknown field colour; allowed: .*clutter"),
-        ("static.builder", "castle", r"static\.builder.*'lab_room' or 'office_floor'"),
+        ("static.builder", "castle", r"static\.builder.*'lab_room', 'office_floor'"),
         ("objects.0.place.yaw", [1.0, 0.0], r"objects\.0\.place.*low must not exceed high"),
         ("objects.0.place", {}, r"objects\.0\.place.*give either 'on'"),
         ("objects.1.model", "materialbox", r"unique.*materialbox"),

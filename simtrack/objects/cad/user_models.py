@@ -25,7 +25,8 @@ from simtrack.objects.cache import digest
 from simtrack.objects.cad.builder import assembled
 from simtrack.objects.cad.model import CadModel, CadPart
 from simtrack.objects.cad.store import cached_models
-from simtrack.objects.user_folder import DEFAULT_DENSITY, MAX_SIZE, MAX_VISUAL_FACES, collision_parts
+from simtrack.objects.decomposition import convex_parts
+from simtrack.objects.user_folder import DEFAULT_DENSITY, MAX_SIZE, MAX_VISUAL_FACES
 
 FRICTION = 0.5
 MAX_MODELS = 2000
@@ -87,7 +88,7 @@ def check_size(mesh: Mesh, path: Path) -> None:
 def part_of_meshes(name: str, mesh: Mesh, path: Path, convex: tuple[Mesh, ...] | None = None) -> CadPart:
     """A part of `DEFAULT_DENSITY` with convex parts from coacd unless they are given."""
     if convex is None:
-        convex = tuple(collision_parts("coacd", mesh, path))
+        convex = tuple(convex_parts(mesh, path))
     closed = meshes.is_closed(mesh) and meshes.volume(mesh) > 0.0
     solid = mesh if closed else meshes.convex_hull(mesh.vertices)
     mass, centre, inertia = meshes.mass_properties(solid, density=DEFAULT_DENSITY)

@@ -4,16 +4,21 @@ The mesh may lack what nobody saw. Below it, the lowest outline is drawn down to
 is (section 2.2 of the reconstruction paper); what noise left below the plane is pressed up to it.
 """
 
+from collections.abc import Sequence
+from contextlib import suppress
+
 import numpy as np
 
+from simtrack import paths
 from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError, MeshError
 from simtrack.geometry.meshes import Mesh, concatenate, convex_hull, decimate, transformed
 from simtrack.geometry.transforms import inverse, transform
+from simtrack.objects.cache import UNUSABLE, digest, mesh_arrays, read_mesh, write_arrays
 from simtrack.objects.cad.model import CadModel, CadPart, CadSupport
+from simtrack.objects.decomposition import DecompositionConfig, convex_parts
 from simtrack.perception.reconstruction.candidates import CadCandidate
 from simtrack.perception.reconstruction.convex_pieces import convex_pieces, levelled
-from simtrack.perception.reconstruction.decomposition import decomposed
 from simtrack.perception.reconstruction.physical import physical_properties
 from simtrack.perception.scene_graph.contact.nodes import EntityNode
 
@@ -23,6 +28,12 @@ PREFIX = "own-"
 SHOWN_FACES = 6000
 FOOT = 0.02
 """Metres above the lowest point from which the outline is drawn down."""
+DECOMPOSITION = DecompositionConfig(0.06, 24, 40, 1000, 12, 60)
+"""Finer than that of users' objects: furniture is larger, and what stands on it has to find it."""
+FACES = 2000
+"""Faces of a mesh that is decomposed."""
+TIME_LIMIT = 240.0
+"""Seconds."""
 THICKNESS = 0.002
 """Metres that a flat entity is given."""
 LEVEL = 0.9
@@ -48,7 +59,7 @@ def own_candidate(node: EntityNode) -> tuple[CadCandidate, str]:
     mesh, flat = _solidified(seen)
     low = -0.5 * float(node.box.extents[2])
     hulls, rest = convex_pieces(mesh)
-    pieces, failure = decomposed(rest, node.semantic_class) if rest is not None else ((), "")
+    pieces, failure = _decomposed(rest, node) if rest is not None else ((), "")
     parts = [_pressed(part, low) for part in (*hulls, *pieces)]
     foot = _foot(mesh, low)
     if foot is not None:
@@ -84,6 +95,24 @@ def own_candidate(node: EntityNode) -> tuple[CadCandidate, str]:
     said = [f"{failure}: its convex hull stands for it in physics"] if failure else []
     said += [f"it is flat and was given {1e3 * THICKNESS:g} mm of thickness"] if flat else []
     return CadCandidate(model, node.box.T_map_box, 1.0), "; ".join(said)
+
+
+def _decomposed(mesh: Mesh, node: EntityNode) -> tuple[Sequence[Mesh], str]:
+    """Convex parts of a mesh, from the disk cache if it was decomposed before; its hull, and why, if that fails."""
+    key = digest(mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((DECOMPOSITION, FACES)).encode())
+    path = paths.cache_dir() / "convex" / f"{key}.npz"
+    with suppress(*UNUSABLE), path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+        return [read_mesh(data, f"part{k}") for k in range(len(data.files) // 2)], ""
+    try:
+        parts = convex_parts(mesh, node.name, DECOMPOSITION, max_faces=FACES, time_limit=TIME_LIMIT)
+    except MeshError as error:
+        return [convex_hull(mesh.vertices)], error.reason
+    arrays: dict[str, np.ndarray] = {}
+    for k, part in enumerate(parts):
+        arrays |= mesh_arrays(f"part{k}", part)
+    with suppress(OSError):
+        write_arrays(path, arrays)
+    return parts, ""
 
 
 def _solidified(mesh: Mesh) -> tuple[Mesh, bool]:

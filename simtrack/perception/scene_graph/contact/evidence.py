@@ -79,8 +79,8 @@ class Posed:
             raise InvalidValueError("node.shape", None, f"a mesh; '{node.name}' was read from a file without one")
         self.node = node
         self.shape: EntityShape = node.shape
-        self.vertices: Float64 = apply(node.T_map_entity, node.shape.mesh.vertices)
-        self.faces: Int32 = node.shape.mesh.faces
+        self.vertices: Float64 = apply(node.T_map_entity, node.shape.coarse.vertices)
+        self.faces: Int32 = node.shape.coarse.faces
         self.hull: Float64 = apply(node.T_map_entity, node.shape.hull)
         self.centre_of_mass: Float64 = apply(node.T_map_entity, node.shape.centre_of_mass[None])[0]
         T, half = node.box.T_map_box, 0.5 * node.box.extents
@@ -91,15 +91,12 @@ class Posed:
         self._planes: dict[int, tuple[Float64, Int32]] = {}
         self._outline: tuple[Float64, Int32] | None = None
         self._underside: float | None = None
-        self._faces: dict[int, Int32] = {}
         self.needs_hold: bool | None = None
         """Whether it is tilted and would topple, once that is known; see `leaning`."""
 
     def faces_of(self, plane: int) -> Int32:
-        """(K, 3) faces on one of the node's planes."""
-        if plane not in self._faces:
-            self._faces[plane] = self.faces[self.node.planes[plane].faces]
-        return self._faces[plane]
+        """(K, 3) faces on one of the node's planes; none on hidden ones."""
+        return self.shape.coarse_planes[plane] if plane < len(self.shape.coarse_planes) else self.faces[:0]
 
     def plane_outline(self, plane: int) -> Float64:
         """(K, 3) corners of the convex hull of what lies on a plane."""
@@ -122,7 +119,7 @@ class Posed:
     def underside(self) -> float:
         """Area of faces that look down from near the bottom, in terms of the footprint: whether it was seen."""
         if self._underside is None:
-            mesh = self.shape.mesh
+            mesh = self.shape.coarse
             down = (face_normals(mesh) @ self.node.T_map_entity[2, :3]) < -0.5
             low = self.vertices[self.faces, 2].max(axis=1) < self.node.bottom + 0.02 + 0.1 * self.node.box.extents[2]
             self._underside = float(face_areas(mesh)[down & low].sum()) / max(self.footprint, 1e-12)

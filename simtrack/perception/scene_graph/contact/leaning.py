@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from simtrack.geometry.transforms import apply
 from simtrack.perception.scene_graph.contact.evidence import ContactConfig, Posed
 from simtrack.perception.scene_graph.contact.graph import Leaning, Support, SupportKind
 from simtrack.perception.scene_graph.contact.nodes import EntityKind
@@ -45,7 +46,8 @@ def topples(body: Posed, config: ContactConfig) -> bool:
     """Whether the centre of mass is beside the hull of what touches the ground."""
     from simtrack.geometry.upright_boxes import horizontal_hull
 
-    lowest = body.vertices[np.unique(body.faces)]
+    mesh = body.shape.mesh  # the coarse one's lowest points may be missing
+    lowest = apply(body.node.T_map_entity, mesh.vertices[np.unique(mesh.faces)])
     lowest = lowest[lowest[:, 2] <= body.node.bottom + min(config.touch, 0.1 * float(body.node.box.extents[2]))]
     return distance_outside(horizontal_hull(lowest), body.centre_of_mass[:2]) > 0.005
 

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from simtrack.contracts import Float64
+from simtrack.contracts import Float64, Int32
 from simtrack.errors import InvalidValueError, MeshError, SimtrackError
 from simtrack.geometry.boxes import OrientedBox
 from simtrack.geometry.meshes import Mesh, convex_hull, face_areas, is_closed, mass_properties, validate, volume
 from simtrack.geometry.planes import PlaneConfig, SurfacePlane, detect_planes
 from simtrack.geometry.transforms import apply, is_rigid
 from simtrack.geometry.upright_boxes import horizontal_hull, upright_box
+from simtrack.perception.scene_graph.contact.coarse import coarse_surface
 
 if TYPE_CHECKING:
     from simtrack.raycast import TriangleMesh
@@ -94,6 +95,10 @@ class EntityShape:
     planes: tuple[SurfacePlane, ...]
     outlines: tuple[Float64, ...]
     """(K, 3) corners of the convex hull of what lies on each plane."""
+    coarse: Mesh
+    """The mesh, or of a finer one a copy with about `coarse.COARSE_FACES` faces: what contact is judged by."""
+    coarse_planes: tuple[Int32, ...]
+    """(K, 3) faces of `coarse` that lie on each plane."""
     hull: Float64
     """(K, 3), corners of the convex hull."""
     centre_of_mass: Float64
@@ -134,8 +139,18 @@ def entity_shape(
         weights = face_areas(mesh)
         centre = weights @ mesh.triangles.mean(axis=1) / weights.sum()
     outlines = tuple(_outline(mesh, plane) for plane in planes)
+    coarse, coarse_planes = coarse_surface(mesh, planes)
     return EntityShape(
-        mesh, planes, outlines, hull, centre, closed, TriangleMesh(mesh.vertices, mesh.faces, source), solid
+        mesh=mesh,
+        planes=planes,
+        outlines=outlines,
+        coarse=coarse,
+        coarse_planes=coarse_planes,
+        hull=hull,
+        centre_of_mass=centre,
+        closed=closed,
+        surface=TriangleMesh(mesh.vertices, mesh.faces, source),
+        solid=solid,
     )
 
 

@@ -7,10 +7,11 @@ import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Float64
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.meshes import Mesh, area, subdivide_to
+from simtrack.geometry.meshes import Mesh, area, face_areas, subdivide_to
 from simtrack.geometry.transforms import transform
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 from simtrack.simulation.building.rooms.physics import SettledRoom
+from simtrack.simulation.building.rooms.visibility import visible_faces
 
 CAMERA = CameraIntrinsics(320, 240, 288.5, 288.5, 159.5, 119.5)
 """An Xtion at half its resolution: rays 3.5 mm apart at a metre."""
@@ -47,7 +48,7 @@ class SeenEntity:
     mesh: Mesh
     """The seen triangles, their vertices where the fused readings put them, map frame; empty if nothing was seen."""
     seen: float
-    """Share of the entity's surface that was seen."""
+    """Share of the surface that was seen, of what can be seen at all from outside the entity (`visible_faces`)."""
 
 
 def walk_poses(room: SettledRoom, config: WalkConfig, rng: np.random.Generator) -> list[Float64]:
@@ -127,6 +128,7 @@ def _fused(
     vertices = mesh.vertices + moved / np.maximum(weights, 1.0)[:, None]
     used, faces = np.unique(corners, return_inverse=True)
     colors = None if mesh.face_colors is None else mesh.face_colors[kept]
-    share = area(Mesh(mesh.vertices, mesh.faces[kept])) / area(mesh)
+    areas = face_areas(mesh)
+    share = areas[kept].sum() / areas[kept | visible_faces(mesh)].sum()
     seen = Mesh(vertices[used], faces.reshape(-1, 3).astype(np.int32), colors)
     return SeenEntity(name, semantic_class, seen, float(share))
