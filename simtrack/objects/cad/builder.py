@@ -55,7 +55,7 @@ class PartBuilder:
 
     def beam(self, a: Point, b: Point, thickness: float | tuple[float, float], material: Material) -> None:
         """Add a leg or strut: square of side `thickness` (at both ends) from a to b, ends level."""
-        ends = (thickness, thickness) if isinstance(thickness, float) else thickness
+        ends = thickness if isinstance(thickness, tuple) else (thickness, thickness)
         tips = [box((t, t, 0.004)).at(*p) for p, t in zip((a, b), ends, strict=True)]
         self.add(hull(material.color, *tips), material)
 

@@ -9,7 +9,7 @@ from simtrack.contracts import Bool, Float64
 from simtrack.geometry.meshes import Mesh, area, concatenate, face_areas, face_normals, sample_surface
 
 if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
 SAMPLES = 1500
 TOLERANCE = 0.03
@@ -67,20 +67,20 @@ def _curved(mesh: Mesh, normals: Float64) -> Bool:
     return curved
 
 
-def _share_near(tree: "cKDTree", points: Float64, limit: float) -> float:
+def _share_near(tree: "KDTree", points: Float64, limit: float) -> float:
     """Share of (N, 3) points that have one of the tree's within `limit` metres."""
     return float(np.isfinite(tree.query(points, distance_upper_bound=limit)[0]).mean())
 
 
 def yaw_symmetries(meshes: Sequence[Mesh]) -> Float64:
     """(S,) turns about z through the origin, in (-pi, pi], 0 first, that map the meshes together onto themselves."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     whole = concatenate(meshes)
     rng = np.random.default_rng(0)
     points, _ = sample_surface(whole, SAMPLES, rng)
     dense, _ = sample_surface(whole, 4 * SAMPLES, rng)
-    tree = cKDTree(dense)
+    tree = KDTree(dense)
     spacing = np.sqrt(area(whole) / len(dense))
     limit = max(TOLERANCE * float(whole.extents[:2].max()), 1.5 * spacing)
     found = [0.0]

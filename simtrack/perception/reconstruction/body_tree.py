@@ -270,14 +270,16 @@ class BodyTree:
     def rigid_groups(self) -> dict[str, str]:
         """Body name -> name of the topmost body of the object that it is a rigid part of.
 
-        Fixed joints tie an object together, except those to a static scene root: furniture that is fixed to the floor
-        is an object of its own.
+        Fixed joints tie an object together, except those to the static scene root, and those of what has a mass to
+        what has none: furniture that is fixed to the floor is an object of its own.
         """
         group: dict[str, str] = {}
         root = self.bodies[0]
         for body in self.bodies:
             joint = body.joint
-            tied = joint is not None and joint.kind == "fixed" and not (joint.parent == root.name and root.mass == 0.0)
+            tied = joint is not None and joint.kind == "fixed"
+            if joint is not None and self.by_name[joint.parent].mass == 0.0:
+                tied = tied and body.mass == 0.0 and joint.parent != root.name
             group[body.name] = group[joint.parent] if joint is not None and tied else body.name
         return group
 

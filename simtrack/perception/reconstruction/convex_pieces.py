@@ -36,6 +36,8 @@ SAMPLES = 400
 """Points at which a hull is compared with its piece."""
 THICKNESS = 0.002
 """Metres that a flat piece is given."""
+SLIVER = 1e-4
+"""Width over length below which a flat piece is a line."""
 MAX_PIECES = 200
 MAX_SHELL = 150
 """Faces up to which a hollow piece is plates behind its faces."""
@@ -151,7 +153,7 @@ def _thickened(piece: Mesh) -> Mesh | None:
     """The hull of a flat sheet, made thick away from the side that it shows; None for a line or a point."""
     normal = face_areas(piece) @ face_normals(piece)
     length = float(np.linalg.norm(normal))
-    if length < 1e-12:
+    if length < SLIVER * float(piece.extents @ piece.extents):
         return None
     try:
         return convex_hull(np.concatenate([piece.vertices, piece.vertices - THICKNESS * normal / length]))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtrack.contracts import Float64
+from simtrack.errors import MeshError
 from simtrack.geometry.meshes import convex_hull
 from simtrack.perception.reconstruction.solids import Solid
 
@@ -36,7 +37,10 @@ class Interference:
             body.explicitinertial = True
             body.mass, body.inertia = 1.0, [1.0, 1.0, 1.0]
             for k, piece in enumerate(solid.pieces):
-                hull = convex_hull(piece)
+                try:
+                    hull = convex_hull(piece)
+                except MeshError:  # too thin to be in anything
+                    continue
                 mesh = spec.add_mesh(name=f"{number}/{k}")
                 mesh.uservert, mesh.userface = hull.vertices.ravel(), hull.faces.ravel()
                 mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX

@@ -29,7 +29,8 @@ FIXED_CLASSES = frozenset(
 LIFTABLE = 23.0
 """Kilograms: load constant of the revised NIOSH lifting equation (Waters et al., 1993); what is heavier is fixed."""
 LAYOUT_FRICTION = 0.6
-ROOT = "scene"
+ROOT, GROUND = "scene", "ground"
+"""Bodies that stand for no entity."""
 
 
 def kinematic_tree(
@@ -48,15 +49,14 @@ def kinematic_tree(
         ground: height in metres of a level ground that nobody saw; none if None.
         parts: entity -> part of its supporter's model that it stands on; the base if it is not told.
     """
-    taken: set[str] = set()
-    root = Body(_unique(ROOT, taken), semantic_class="scene")
-    bodies, of_entity = [root], {SCENE: root.name}
-    poses = {root.name: np.eye(4)}
+    of_entity = body_names(graph)
+    taken = {*of_entity.values(), GROUND}
+    root = Body(ROOT, semantic_class="scene")
+    bodies, poses = [root], {ROOT: np.eye(4)}
     links: dict[tuple[str, str], str] = {}
     if ground is not None:
-        bodies.append(_ground(_unique("ground", taken), root.name, ground))
-        poses[bodies[-1].name] = np.eye(4)
-    of_entity |= {entity: _unique(_printable(entity), taken) for entity in graph.descendants()}
+        bodies.append(_ground(GROUND, ROOT, ground))
+        poses[GROUND] = np.eye(4)
     for entity in graph.descendants():
         node, body_name = graph.nodes[entity], of_entity[entity]
         parent = of_entity[graph.supports[entity].parent]
@@ -84,6 +84,12 @@ def kinematic_tree(
             links[entity, part] = body.name
             poses[body.name] = poses[body.joint.parent] @ body.joint.T_parent_body
     return BodyTree(_printable(name), tuple(bodies))
+
+
+def body_names(graph: ContactGraph) -> dict[str, str]:
+    """Entity -> the body in the tree that is all of it, or its base; the scene node's is the root."""
+    taken = {ROOT, GROUND}
+    return {SCENE: ROOT} | {entity: _unique(_printable(entity), taken) for entity in graph.descendants()}
 
 
 def is_free(graph: ContactGraph, entity: str, candidate: CadCandidate, *, grounded: bool = False) -> bool:

@@ -4,11 +4,12 @@
     write_scene(reconstruction.tree, "scene")
 
 Section 4 of the reconstruction paper: matching and alignment (4.2, 4.3), the global check (4.4), the kinematic tree
-(4.5). No entity is lost: what no CAD model fits stays as its own mesh, and a finding says so.
+(4.5). What is free settles before the tree is final, which the paper lacks. No entity is lost: what no CAD model fits
+stays as its own mesh, and a finding says so.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -18,10 +19,11 @@ from simtrack.errors import MeshError, UnknownNameError
 from simtrack.objects.cad import CadModel, cad_classes, cad_models
 from simtrack.perception.reconstruction.body_tree import BodyTree
 from simtrack.perception.reconstruction.candidates import CadCandidate
-from simtrack.perception.reconstruction.kinematic_tree import kinematic_tree
+from simtrack.perception.reconstruction.kinematic_tree import body_names, kinematic_tree
 from simtrack.perception.reconstruction.own_model import is_own, own_candidate
 from simtrack.perception.reconstruction.selection import Rejection, Selection, SelectionConfig, select
-from simtrack.perception.reconstruction.snapping import Snapped, SnappingConfig, snap
+from simtrack.perception.reconstruction.settling import Settled, SettlingConfig, settle
+from simtrack.perception.reconstruction.snapping import Snapped, SnappingConfig, eq1_residuals, snap
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_layout
 from simtrack.perception.scene_graph.contact.nodes import FLOOR, SCENE, EntityNode
 
@@ -56,6 +58,8 @@ class NoteCode(StrEnum):
     """No floor was seen: a level ground lies below the lowest entity."""
     HELD = "held"
     """Nothing supports it: it is fixed where it was seen."""
+    UNSTABLE = "unstable"
+    """It would topple or slide far from where it was seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +78,7 @@ class ReconstructionConfig:
 
     selection: SelectionConfig = field(default_factory=SelectionConfig)
     snapping: SnappingConfig = field(default_factory=SnappingConfig)
+    settling: SettlingConfig = field(default_factory=SettlingConfig)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +92,7 @@ class Choice:
     offered: int
     """Length of the shortlist."""
     shift: Float64
-    """(3,), translation by the snapping, metres."""
+    """(3,), translation from where alignment had it, by snapping and settling, metres."""
     residual: float
     """D of Eq. 1 after snapping, metres; NaN where Eq. 1 does not apply."""
     rejected: tuple[Rejection, ...]
@@ -146,20 +151,35 @@ def reconstruct(
     say("snapping", 0.9)
     snapped = snap(graph, chosen, config.snapping, ground)
     _snapping_notes(graph, snapped, notes)
-    say("kinematic tree", 0.98)
+    say("kinematic tree", 0.93)
     tree = kinematic_tree(name, graph, snapped.candidates, ground, snapped.parts)
+    say("settling", 0.95)
+    settled = settle(tree, config.settling)
+    _settling_notes(graph, settled, notes)
+    placed = _settled(graph, snapped.candidates, settled)
+    tree = kinematic_tree(name, graph, placed, ground, snapped.parts)
+    residuals = eq1_residuals(graph, placed, config.snapping)
     choices = {
         entity: Choice(
-            candidate=snapped.candidates[entity],
+            candidate=placed[entity],
             rank=rank,
             offered=len(shortlists[entity]),
-            shift=snapped.shifts[entity],
-            residual=snapped.residuals.get(entity, np.nan),
+            shift=placed[entity].T_map_model[:3, 3] - chosen[entity].T_map_model[:3, 3],
+            residual=residuals.get(entity, np.nan),
             rejected=tuple(selection.rejected.get(entity, ())),
         )
         for entity, rank in selection.chosen.items()
     }
     return Reconstruction(name, graph, choices, tree, tuple(notes))
+
+
+def _settled(graph: ContactGraph, candidates: Mapping[str, CadCandidate], settled: Settled) -> dict[str, CadCandidate]:
+    """The candidates at the poses that their bodies settled at."""
+    names = body_names(graph)
+    return {
+        entity: replace(candidate, T_map_model=settled.poses.get(names[entity], candidate.T_map_model))
+        for entity, candidate in candidates.items()
+    }
 
 
 def _default_shortlist() -> Shortlist:
@@ -205,15 +225,17 @@ def _offer_own_meshes(
     say: Progress,
     notes: list[Note],
 ) -> bool:
-    """Where no model has a place for what stands in an entity, its own mesh may have; whether any was added."""
+    """Where no model out of the walls has a place for what stands on an entity, offer its own mesh; whether any was."""
     found = False
     for name, children in selection.homeless.items():
-        if not children or any(is_own(candidate) for candidate in shortlists[name]):
+        walled = name in selection.in_layout
+        if not (children or walled) or any(is_own(candidate) for candidate in shortlists[name]):
             continue
         say(f"decomposing {name}", 0.85)
         own = _own(graph.nodes[name], notes)
         shortlists[name] = (*shortlists[name], *own)
-        message = f"no model of its class has a place for {', '.join(children)}; its own mesh is tried"
+        lacks = f"has a place for {', '.join(children)}" if children else "stands out of the walls"
+        message = f"no model of its class {lacks}; its own mesh is tried"
         notes.append(Note(NoteCode.NO_CANDIDATE, name, message))
         found = found or bool(own)
     return found
@@ -263,3 +285,13 @@ def _snapping_notes(graph: ContactGraph, snapped: Snapped, notes: list[Note]) ->
     for first, second, depth in snapped.stuck:
         message = f"is still {1e3 * depth:.1f} mm deep in '{second}' after snapping"
         notes.append(Note(NoteCode.INTERPENETRATING, first, message))
+
+
+def _settling_notes(graph: ContactGraph, settled: Settled, notes: list[Note]) -> None:
+    for entity, body in body_names(graph).items():
+        if body in settled.held:
+            motion = settled.held[body]
+            went = f"{1e3 * motion.shift:.0f} mm and turn by {np.degrees(motion.turn):.0f} degrees"
+            notes.append(
+                Note(NoteCode.UNSTABLE, entity, f"it would go {went} before it rests; it is left in its place")
+            )

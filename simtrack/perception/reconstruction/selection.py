@@ -22,6 +22,8 @@ from simtrack.perception.scene_graph.contact.nodes import FLOOR
 
 INNER = 0.8
 """Sides of the part of a child's box, about its middle, that has to be free: models are not exactly alike."""
+OVERHANG = 0.15
+"""Share of its width by which the middle of what stands on a face stays away from the face's edge."""
 MOST_TAKEN = 0.15
 """Share of it that the model may take."""
 
@@ -38,6 +40,8 @@ class SelectionConfig:
     """How far a candidate's support may lie above or below where the child stands: snapping moves the child."""
     far: float = 0.2
     """The same for any place at all."""
+    aside: float = 0.15
+    """How far beside a face a child may stand to have a place there: snapping brings it on."""
     wall_depth: float = 0.06
     """How far a candidate may stand in layout: snapping pushes it out."""
     overlap_depth: float = 0.01
@@ -51,7 +55,7 @@ class SelectionConfig:
         for name in ("contact_area", "weak_area"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"SelectionConfig.{name}", getattr(self, name), "a share in (0, 1]")
-        for name in ("height", "far", "wall_depth", "overlap_depth"):
+        for name in ("height", "far", "aside", "wall_depth", "overlap_depth"):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise InvalidValueError(f"SelectionConfig.{name}", getattr(self, name), "finite and >= 0")
         if self.steps < 0:
@@ -78,7 +82,9 @@ class Selection:
     lost: dict[str, list[str]] = field(default_factory=dict)
     """Entity -> children that its chosen candidate does not support as Eq. 2 asks."""
     homeless: dict[str, list[str]] = field(default_factory=dict)
-    """Entity -> those of them that its candidate has no place for at all."""
+    """Entity -> those of them that none of its candidates has a place for beside the others; empty where all have."""
+    dropped: dict[str, list[list[str]]] = field(default_factory=dict)
+    """Entity -> such children of each of its candidates."""
     in_layout: dict[str, float] = field(default_factory=dict)
     """Entity -> depth in metres, where every candidate stands too deep in layout."""
     conflicts: list[tuple[str, str, float]] = field(default_factory=list)
@@ -96,9 +102,14 @@ def select(
     kept = {name: _kept(graph, name, shortlists[name], solids[name], layout, config, out) for name in solids}
     _min_conflicts(graph, kept, solids, config, out)
     for name, ranks in kept.items():
+        taken = out.chosen[name]
+        if out.dropped[name][taken]:
+            out.lost[name] = out.dropped[name][taken]
         for rank in ranks:
-            if rank < out.chosen[name]:
-                reason = "stands in another entity's model"
+            if rank < taken:
+                less = out.dropped[name][rank]
+                few = len(less) > len(out.dropped[name][taken])
+                reason = f"cannot support {', '.join(less)} (Eq. 2)" if few else "stands in another entity's model"
                 out.rejected.setdefault(name, []).append(Rejection(rank, shortlists[name][rank].model.name, reason))
     return out
 
@@ -115,39 +126,48 @@ def _kept(
     config: SelectionConfig,
     out: Selection,
 ) -> list[int]:
-    """Ranks that survive; if none does, those that keep most children, of them those least deep in layout."""
+    """Ranks that survive, those first that support most children.
+
+    They have a place for all children and stand out of the walls; if there is none, those with places for most, of them
+    those least deep in layout.
+    """
     children = [c for c in graph.children(name) if graph.supports[c].kind in (SupportKind.ON, SupportKind.INSIDE)]
+    pairs = list(zip(candidates, solids, strict=True))
     dropped = [
         [c for c in children if place_of(y, solid, graph, c, config.height, config.contact_area) is None]
-        for y, solid in zip(candidates, solids, strict=True)
+        for y, solid in pairs
+    ]
+    homeless = [
+        [c for c in lost if place_of(y, solid, graph, c, config.far, config.weak_area, config.aside) is None]
+        for (y, solid), lost in zip(pairs, dropped, strict=True)
     ]
     depths = [max((depth_along(solid, slab, normal) for slab, normal in layout), default=0.0) for solid in solids]
-    fewest = min(len(names) for names in dropped)
-    able = [k for k, names in enumerate(dropped) if len(names) == fewest]
+    fewest = min(len(names) for names in homeless)
+    able = [k for k, names in enumerate(homeless) if len(names) == fewest]
     least = max(min(depths[k] for k in able), config.wall_depth)
-    ranks = [k for k in able if depths[k] <= least]
+    ranks = sorted((k for k in able if depths[k] <= least), key=lambda k: len(dropped[k]))
     for k, candidate in enumerate(candidates):
         if k in ranks:
             continue
-        names = ", ".join(dropped[k])
+        names = ", ".join(homeless[k])
         reason = (
             f"cannot support {names} (Eq. 2)" if k not in able else f"stands {1e3 * depths[k]:.0f} mm deep in layout"
         )
         out.rejected.setdefault(name, []).append(Rejection(k, candidate.model.name, reason))
-    if fewest:
-        best = ranks[0]
-        out.lost[name] = dropped[best]
-        out.homeless[name] = [
-            c for c in dropped[best]
-            if place_of(candidates[best], solids[best], graph, c, config.far, config.weak_area) is None
-        ]  # fmt: skip
+    out.dropped[name], out.homeless[name] = dropped, homeless[ranks[0]]
     if least > config.wall_depth:
         out.in_layout[name] = least
     return ranks
 
 
 def place_of(
-    candidate: CadCandidate, solid: Solid, graph: ContactGraph, child: str, reach: float, least: float
+    candidate: CadCandidate,
+    solid: Solid,
+    graph: ContactGraph,
+    child: str,
+    reach: float,
+    least: float,
+    aside: float = 0.0,
 ) -> PlacedSupport | None:
     """Where a child of the graph would stand on (or in) a candidate, and has room; None if nowhere.
 
@@ -158,8 +178,9 @@ def place_of(
         child: its name.
         reach: metres that the face may lie above or below.
         least: A of Eq. 2 that is asked.
+        aside: metres that the face may lie beside the child.
     """
-    return best_face(candidate, graph.nodes[child].box, graph.supports[child].height, reach, least, solid)
+    return best_face(candidate, graph.nodes[child].box, graph.supports[child].height, reach, least, solid, aside)
 
 
 def standing_faces(candidate: CadCandidate) -> tuple[PlacedSupport, ...]:
@@ -172,17 +193,43 @@ def standing_faces(candidate: CadCandidate) -> tuple[PlacedSupport, ...]:
 
 
 def best_face(
-    candidate: CadCandidate, child: OrientedBox, height: float, reach: float, least: float, solid: Solid
+    candidate: CadCandidate,
+    child: OrientedBox,
+    height: float,
+    reach: float,
+    least: float,
+    solid: Solid,
+    aside: float = 0.0,
 ) -> PlacedSupport | None:
     """The face nearest to a height under at least a share of the child's bottom (A of Eq. 2) that has room above it.
 
-    None if there is none within `reach` metres.
+    None if there is none within `reach` metres up or down. With `aside`, the child is brought onto the face first, so
+    many metres at most.
     """
     near = [face for face in standing_faces(candidate) if abs(face.height - height) <= reach]
     for face in sorted(near, key=lambda face: abs(face.height - height)):
-        if contact_share(child, face) >= least and _has_room(solid, child, face.height):
+        moved = child
+        if aside > 0.0:
+            step = step_onto(face, child.corners)
+            if np.linalg.norm(step) > aside:
+                continue
+            moved = OrientedBox(transform(None, step) @ child.T_map_box, child.extents)
+        if contact_share(moved, face) >= least and _has_room(solid, moved, face.height):
             return face
     return None
+
+
+def step_onto(face: PlacedSupport, points: Float64, *, inside: bool = False) -> Float64:
+    """(3,) level translation of (N, 3) points after which their middle is over a face, off its edges by `OVERHANG`.
+
+    If they are `inside`, all of them are over the face, as far as it is large enough.
+    """
+    R, origin = face.T_map_support[:2, :2], face.T_map_support[:2, 3]
+    local = (points[:, :2] - origin) @ R
+    low, high = local.min(axis=0), local.max(axis=0)
+    free = np.maximum(0.5 * face.size - (0.5 if inside else OVERHANG) * (high - low), 0.0)
+    middle = 0.5 * (low + high)
+    return np.append(R @ (np.clip(middle, -free, free) - middle), 0.0)
 
 
 def _has_room(solid: Solid, child: OrientedBox, height: float) -> bool:
@@ -269,7 +316,7 @@ def _min_conflicts(
         if not struck:
             break
         name = struck[int(rng.integers(len(struck)))]
-        chosen[name] = min(kept[name], key=lambda rank: (conflicts.cost(name, rank, chosen), rank))
+        chosen[name] = min(kept[name], key=lambda rank: (conflicts.cost(name, rank, chosen), kept[name].index(rank)))
     out.chosen = best
     for name in best:
         for other in conflicts.near[name]:

@@ -18,7 +18,7 @@ from simtrack.perception.reconstruction.candidates import CadCandidate, PlacedSu
 from simtrack.perception.reconstruction.interference import Contact, Interference
 from simtrack.perception.reconstruction.kinematic_tree import FIXED_CLASSES, scaled_mass
 from simtrack.perception.reconstruction.layout import layout_slabs
-from simtrack.perception.reconstruction.selection import best_face
+from simtrack.perception.reconstruction.selection import best_face, step_onto
 from simtrack.perception.reconstruction.solids import Solid, resting_rise, solid_of
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
 from simtrack.perception.scene_graph.contact.nodes import SCENE
@@ -27,10 +27,10 @@ SLACK = 2e-4
 """Metres that pushed models keep between them."""
 LEAST_AREA = 0.2
 """Share of a bottom over a face from which it is taken for the one that is stood on."""
-OVERHANG = 0.15
-"""Share of its width by which the middle of what stands on a face stays away from the face's edge."""
 STILL = 1e-7
 """Metres that are no motion."""
+TOP = 0.01
+"""Metres by which an entity may stand lower than the top of another to stand on it."""
 LEVEL = 0.7
 """|z| of a contact's normal from which it is a matter of support."""
 
@@ -41,6 +41,8 @@ class SnappingConfig:
 
     reach: float = 0.2
     """How far above or below its place a face to stand on is looked for."""
+    aside: float = 0.15
+    """How far beside its place it is looked for, if there is none at its place."""
     sink: float = 0.04
     """How far a model may stand in what it stands on, at most half of its height; what is deeper in is beside it."""
     depth: float = 0.001
@@ -49,7 +51,7 @@ class SnappingConfig:
     """Of pushing apart."""
 
     def __post_init__(self) -> None:
-        for name in ("reach", "sink", "depth"):
+        for name in ("reach", "aside", "sink", "depth"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"SnappingConfig.{name}", getattr(self, name), "a positive finite length")
         if self.rounds < 0:
@@ -64,8 +66,6 @@ class Snapped:
     """At their final poses."""
     shifts: dict[str, Float64]
     """Entity -> (3,) translation from where alignment had it, metres."""
-    residuals: dict[str, float]
-    """Entity -> D of Eq. 1 that is left, metres; of those that stand on something."""
     parts: dict[str, str]
     """Entity -> part of its supporter's model that it stands on, a drawer say; where the model tells."""
     afloat: list[str] = field(default_factory=list)
@@ -84,6 +84,39 @@ def snap(
     return _Snapping(graph, chosen, config or SnappingConfig(), ground).run()
 
 
+def eq1_residuals(
+    graph: ContactGraph, placed: Mapping[str, CadCandidate], config: SnappingConfig | None = None
+) -> dict[str, float]:
+    """D of Eq. 1 that is left, metres, of all that stands on something.
+
+    It is the height of the model's lowest point above the highest that it can stand on; NaN where there is nothing
+    below it.
+    """
+    config = config or SnappingConfig()
+    solids = _solids(graph, placed)
+    residuals = {}
+    for name in placed:
+        if graph.supports[name].kind in (SupportKind.ON, SupportKind.INSIDE):
+            below = {p: solids[p] for p in graph.supporters(name) if p in solids}
+            found = resting_rise(solids[name], below, (-config.reach, config.sink))
+            residuals[name] = np.nan if found is None else -found
+    return residuals
+
+
+def _solids(graph: ContactGraph, placed: Mapping[str, CadCandidate]) -> dict[str, Solid]:
+    """Of all entities, parents before children, and of the layout."""
+    solids = {name: solid_of(placed[name]) for name in graph.descendants() if name in placed}
+    for node in graph.nodes.values():
+        if is_layout(node):
+            solids[node.name] = Solid.of([slab.mesh.vertices for slab in layout_slabs(graph, node.name)])
+    return solids
+
+
+def _top(graph: ContactGraph, name: str) -> float:
+    """Height of the highest point of an entity's box, metres."""
+    return float(graph.nodes[name].box.corners[:, 2].max())
+
+
 class _Snapping:
     def __init__(
         self, graph: ContactGraph, chosen: Mapping[str, CadCandidate], config: SnappingConfig, ground: float | None
@@ -91,14 +124,12 @@ class _Snapping:
         self.graph, self.config, self.ground = graph, config, ground
         self.chosen = chosen
         self.order = [name for name in graph.descendants() if name in chosen]
-        self.start = {name: solid_of(chosen[name]) for name in self.order}
-        for node in graph.nodes.values():
-            if is_layout(node):
-                slabs = layout_slabs(graph, node.name)
-                self.start[node.name] = Solid.of([slab.mesh.vertices for slab in slabs])
+        self.start = _solids(graph, chosen)
         self.shifts = {name: np.zeros(3) for name in self.start}
         self.afloat: set[str] = set()
         self.parts: dict[str, str] = {}
+        self.faces: dict[str, tuple[str, PlacedSupport]] = {}
+        """What each stands on: a face of its supporter as that was before it moved."""
         self.rested: dict[str, Float64] = {}
         self.ancestors = {name: self._above(name) for name in self.order}
         self.weight = {name: self._mobility(name) for name in self.start}
@@ -115,11 +146,9 @@ class _Snapping:
                 self._stack()
             stuck = self._deepest(scene.contacts(self.shifts))
         candidates = {name: self._placed(name) for name in self.order}
-        stands = {n: s for n, s in self.graph.supports.items() if s.kind in (SupportKind.ON, SupportKind.INSIDE)}
         return Snapped(
             candidates,
             {name: self.shifts[name] for name in self.order},
-            {name: self._residual(name) for name in stands if name in candidates},
             self.parts,
             sorted(self.afloat),
             [(c.first, c.second, c.depth) for c in stuck],
@@ -154,34 +183,45 @@ class _Snapping:
             box = self.graph.nodes[name].box
             moved = OrientedBox(transform(None, self.shifts[name]) @ box.T_map_box, box.extents)
             at = height + self.shifts[parent][2]
-            face = best_face(self._placed(parent), moved, at, self.config.reach, LEAST_AREA, self._solid(parent))
+            placed, below = self._placed(parent), self._solid(parent)
+            face = None
+            for aside in (0.0, self.config.aside):
+                face = face or best_face(placed, moved, at, self.config.reach, LEAST_AREA, below, aside)
             if face is not None:
                 self.parts[name] = face.part
-                if name not in self.rested:  # once: pushing apart must not be undone
-                    self._bring_onto(name, face, inside=self.graph.supports[name].kind is SupportKind.INSIDE)
+                back = transform(None, -self.shifts[parent]) @ face.T_map_support
+                self.faces[name] = parent, replace(face, T_map_support=back)
+                self._keep_on(name)
                 solid = self._shift(name, np.array([0.0, 0.0, face.height - solid.bottom]))
-        below = {p: self._solid(p) for p in self.graph.supporters(name) if p != SCENE and p in self.start}
-        tall = float(solid.high[:, 2].max() - solid.bottom)
-        up = min(self.config.sink, 0.5 * tall)
-        found = resting_rise(solid, below, (-self.config.reach, up))
+        found = self._rise(name, solid, self.config.reach)
         if found is None:
-            found = resting_rise(solid, below, (-np.inf, up))
+            found = self._rise(name, solid, np.inf)
         if found is None:
             self.afloat.add(name)
         else:
             self._shift(name, np.array([0.0, 0.0, found]))
 
-    def _bring_onto(self, name: str, face: PlacedSupport, *, inside: bool) -> None:
+    def _rise(self, name: str, solid: Solid, reach: float) -> float | None:
+        """Vertical translation onto the supporters, at most `reach` down; onto the top of those it stood on top of."""
+        below = {p: self._solid(p) for p in self.graph.supporters(name) if p != SCENE and p in self.start}
+        bottom = self.graph.nodes[name].bottom
+        topped = {p: s for p, s in below.items() if p in self.chosen and _top(self.graph, p) < bottom + TOP}
+        tall = float(solid.high[:, 2].max() - solid.bottom)
+        rises = (
+            resting_rise(solid, below, (-reach, min(self.config.sink, 0.5 * tall))),
+            resting_rise(solid, topped, (-reach, self.config.reach)),
+        )
+        return max((rise for rise in rises if rise is not None), default=None)
+
+    def _keep_on(self, name: str) -> None:
         """Shift on the level: what stands on a face has its middle over it, what is inside its whole footprint."""
-        solid = self._solid(name)
-        R, origin = face.T_map_support[:2, :2], face.T_map_support[:2, 3]
-        local = (np.concatenate(solid.pieces)[:, :2] - origin) @ R
-        low, high = local.min(axis=0), local.max(axis=0)
-        free = np.maximum(0.5 * face.size - (0.5 if inside else OVERHANG) * (high - low), 0.0)
-        middle = 0.5 * (low + high)
-        step = np.clip(middle, -free, free) - middle
-        if np.abs(step).max() > STILL:
-            self._shift(name, np.append(R @ step, 0.0))
+        if name in self.faces:
+            parent, face = self.faces[name]
+            face = replace(face, T_map_support=transform(None, self.shifts[parent]) @ face.T_map_support)
+            inside = self.graph.supports[name].kind is SupportKind.INSIDE
+            step = step_onto(face, np.concatenate(self._solid(name).pieces), inside=inside)
+            if np.abs(step).max() > STILL:
+                self._shift(name, step)
 
     def _hang(self, name: str, parent: str, index: int) -> None:
         """Move along the normal of the plane that it hangs on, so that they touch."""
@@ -222,6 +262,7 @@ class _Snapping:
         for name, part in ((a, (share - 1.0) * step), (b, share * step)):
             if np.any(part):
                 self._shift(name, part)
+                self._keep_on(name)
         return True
 
     def _deepest(self, contacts: list[Contact]) -> list[Contact]:
@@ -258,9 +299,3 @@ class _Snapping:
             10.0 if self.graph.nodes[name].semantic_class in FIXED_CLASSES else 1.0
         )
         return 1.0 / max(mass, 1e-3)
-
-    def _residual(self, name: str) -> float:
-        """D of Eq. 1: height of the model's bottom above the highest point that it stands on; NaN if on nothing."""
-        below = {p: self._solid(p) for p in self.graph.supporters(name) if p in self.start}
-        found = resting_rise(self._solid(name), below, (-self.config.reach, self.config.sink))
-        return np.nan if found is None else -found

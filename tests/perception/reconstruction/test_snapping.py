@@ -8,7 +8,7 @@ from simtrack.objects.cad.builder import ModelBuilder
 from simtrack.objects.cad.materials import CERAMIC
 from simtrack.objects.cad.model import CadModel
 from simtrack.perception.reconstruction.candidates import CadCandidate
-from simtrack.perception.reconstruction.snapping import snap
+from simtrack.perception.reconstruction.snapping import eq1_residuals, snap
 from simtrack.perception.reconstruction.solids import overlap, solid_of
 
 TABLE = table_model("table-test", (1.0, 0.6, 0.7))
@@ -37,7 +37,9 @@ def test_heights_follow_the_models_from_the_floor_upwards() -> None:
     )
     bottoms = {name: solid_of(candidate).bottom for name, candidate in snapped.candidates.items()}
     assert bottoms == pytest.approx({"table": 0.0, "box": 0.7, "cup": 0.9}, abs=1e-6)
-    assert max(abs(residual) for residual in snapped.residuals.values()) < 1e-6
+    residuals = eq1_residuals(graph, snapped.candidates)
+    assert set(residuals) == {"table", "box", "cup"}
+    assert max(abs(residual) for residual in residuals.values()) < 1e-6
     assert snapped.afloat == [] and snapped.stuck == []
 
 
