@@ -8,14 +8,14 @@ Section 4 of the reconstruction paper: matching and alignment (4.2, 4.3), the gl
 stays as its own mesh, and a finding says so.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 
 from simtrack.contracts import Float64
-from simtrack.errors import MeshError, UnknownNameError
+from simtrack.errors import InvalidValueError, MeshError, UnknownNameError
 from simtrack.objects.cad import CadModel, cad_classes, cad_models
 from simtrack.perception.reconstruction.body_tree import BodyTree
 from simtrack.perception.reconstruction.candidates import CadCandidate
@@ -79,6 +79,12 @@ class ReconstructionConfig:
     selection: SelectionConfig = field(default_factory=SelectionConfig)
     snapping: SnappingConfig = field(default_factory=SnappingConfig)
     settling: SettlingConfig = field(default_factory=SettlingConfig)
+    attempts: int = 4
+    """Selections that are tried until everything comes to rest."""
+
+    def __post_init__(self) -> None:
+        if self.attempts < 1:
+            raise InvalidValueError("ReconstructionConfig.attempts", self.attempts, "1 or more")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,18 +151,15 @@ def reconstruct(
     selection = select(graph, shortlists, config.selection)
     if _offer_own_meshes(graph, shortlists, selection, say, notes):
         selection = select(graph, shortlists, config.selection)
-    chosen = {entity: shortlists[entity][rank] for entity, rank in selection.chosen.items()}
+    ground = _ground(graph, selection.chosen, notes)
+    say("snapping and settling", 0.9)
+    attempt = _settled_attempt(graph, shortlists, selection, ground, config, name)
+    selection, snapped, chosen = attempt.selection, attempt.snapped, attempt.chosen
     _selection_notes(selection, notes)
-    ground = _ground(graph, chosen, notes)
-    say("snapping", 0.9)
-    snapped = snap(graph, chosen, config.snapping, ground)
     _snapping_notes(graph, snapped, notes)
-    say("kinematic tree", 0.93)
-    tree = kinematic_tree(name, graph, snapped.candidates, ground, snapped.parts)
-    say("settling", 0.95)
-    settled = settle(tree, config.settling)
-    _settling_notes(graph, settled, notes)
-    placed = _settled(graph, snapped.candidates, settled)
+    _settling_notes(graph, attempt.settled, notes)
+    placed = _settled(graph, snapped.candidates, attempt.settled)
+    say("kinematic tree", 0.98)
     tree = kinematic_tree(name, graph, placed, ground, snapped.parts)
     residuals = eq1_residuals(graph, placed, config.snapping)
     choices = {
@@ -171,6 +174,48 @@ def reconstruct(
         for entity, rank in selection.chosen.items()
     }
     return Reconstruction(name, graph, choices, tree, tuple(notes))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Attempt:
+    """A selection, and how it comes to rest."""
+
+    selection: Selection
+    chosen: Mapping[str, CadCandidate]
+    snapped: Snapped
+    settled: Settled
+
+    @property
+    def unrest(self) -> tuple[int, float]:
+        """Number of bodies that do not come to rest out of each other, and how deep they are; the less, the better."""
+        return len({*self.settled.held, *self.settled.stuck}), sum(self.settled.stuck.values())
+
+
+def _settled_attempt(
+    graph: ContactGraph,
+    shortlists: Mapping[str, Sequence[CadCandidate]],
+    selection: Selection,
+    ground: float | None,
+    config: ReconstructionConfig,
+    name: str,
+) -> _Attempt:
+    """Snap and settle; what does not come to rest gets other candidates, as long as that helps."""
+    names = body_names(graph)
+    barred: dict[str, set[int]] = {}
+    attempts: list[_Attempt] = []
+    for _ in range(config.attempts):
+        chosen = {entity: shortlists[entity][rank] for entity, rank in selection.chosen.items()}
+        snapped = snap(graph, chosen, config.snapping, ground)
+        tree = kinematic_tree(name, graph, snapped.candidates, ground, snapped.parts)
+        attempts.append(_Attempt(selection, chosen, snapped, settle(tree, config.settling)))
+        settled = attempts[-1].settled
+        restless = [e for e in chosen if names[e] in settled.held or names[e] in settled.stuck]
+        if not any(len(shortlists[entity]) > 1 for entity in restless):
+            break
+        for entity in restless:
+            barred.setdefault(entity, set()).add(selection.chosen[entity])
+        selection = select(graph, shortlists, config.selection, barred)
+    return min(attempts, key=lambda attempt: attempt.unrest)
 
 
 def _settled(graph: ContactGraph, candidates: Mapping[str, CadCandidate], settled: Settled) -> dict[str, CadCandidate]:
@@ -263,7 +308,7 @@ def _selection_notes(selection: Selection, notes: list[Note]) -> None:
         notes.append(Note(NoteCode.CONFLICT, first, message))
 
 
-def _ground(graph: ContactGraph, chosen: Mapping[str, CadCandidate], notes: list[Note]) -> float | None:
+def _ground(graph: ContactGraph, chosen: Collection[str], notes: list[Note]) -> float | None:
     """Height of a floor that nobody saw, if it is needed."""
     loose = [name for name in graph.children(SCENE) if name in chosen]
     if any(node.semantic_class == FLOOR for node in graph.nodes.values()):
@@ -289,6 +334,9 @@ def _snapping_notes(graph: ContactGraph, snapped: Snapped, notes: list[Note]) ->
 
 def _settling_notes(graph: ContactGraph, settled: Settled, notes: list[Note]) -> None:
     for entity, body in body_names(graph).items():
+        if body in settled.stuck:
+            depth = 1e3 * settled.stuck[body]
+            notes.append(Note(NoteCode.INTERPENETRATING, entity, f"is still {depth:.1f} mm deep in another at rest"))
         if body in settled.held:
             motion = settled.held[body]
             went = f"{1e3 * motion.shift:.0f} mm and turn by {np.degrees(motion.turn):.0f} degrees"

@@ -5,7 +5,7 @@ selected for each entity, so that they stay out of each other: min-conflicts sea
 candidates of least alignment error.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,7 +22,7 @@ from simtrack.perception.scene_graph.contact.nodes import FLOOR
 
 INNER = 0.8
 """Sides of the part of a child's box, about its middle, that has to be free: models are not exactly alike."""
-OVERHANG = 0.15
+OVERHANG = 0.3
 """Share of its width by which the middle of what stands on a face stays away from the face's edge."""
 MOST_TAKEN = 0.15
 """Share of it that the model may take."""
@@ -92,14 +92,22 @@ class Selection:
 
 
 def select(
-    graph: ContactGraph, shortlists: Mapping[str, Sequence[CadCandidate]], config: SelectionConfig | None = None
+    graph: ContactGraph,
+    shortlists: Mapping[str, Sequence[CadCandidate]],
+    config: SelectionConfig | None = None,
+    barred: Mapping[str, Collection[int]] | None = None,
 ) -> Selection:
-    """Select one candidate for every entity that has any; `shortlists` are sorted by alignment error."""
+    """Select one candidate for every entity that has any; `shortlists` are sorted by alignment error.
+
+    The ranks that are `barred` are taken only where nothing else is left.
+    """
     config = config or SelectionConfig()
     out = Selection()
     solids = {name: [solid_of(candidate) for candidate in found] for name, found in shortlists.items() if found}
     layout = _upright_layout(graph)
     kept = {name: _kept(graph, name, shortlists[name], solids[name], layout, config, out) for name in solids}
+    for name, ranks in (barred or {}).items():
+        kept[name] = [rank for rank in kept[name] if rank not in ranks] or kept[name]
     _min_conflicts(graph, kept, solids, config, out)
     for name, ranks in kept.items():
         taken = out.chosen[name]

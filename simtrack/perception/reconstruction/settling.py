@@ -43,13 +43,15 @@ class SettlingConfig:
     """Radians that a body may turn away from its pose."""
     rest: float = 0.001
     """Metres of motion of any of its points up to which a body is at rest where it is, and stays exactly there."""
+    depth: float = 0.003
+    """Metres that a body may be in another at rest."""
     friction: float = 0.8
     """Share of the friction that is counted on."""
     rounds: int = 4
     """Of holding what went too far and settling the others again; 0: nothing settles."""
 
     def __post_init__(self) -> None:
-        for name in ("shift", "turn", "rest"):
+        for name in ("shift", "turn", "rest", "depth"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"SettlingConfig.{name}", getattr(self, name), "positive and finite")
         if not 0.0 < self.friction <= 1.0:
@@ -76,6 +78,8 @@ class Settled:
     """Root body of each free component -> (4, 4) T_scene_body; as given for what did not move, or was held."""
     held: Mapping[str, Motion]
     """Bodies that would have gone too far, and how far."""
+    stuck: Mapping[str, float]
+    """Free components that are deeper than `SettlingConfig.depth` in another at rest, and how deep, metres."""
 
 
 def settle(tree: BodyTree, config: SettlingConfig | None = None) -> Settled:
@@ -83,11 +87,12 @@ def settle(tree: BodyTree, config: SettlingConfig | None = None) -> Settled:
     config = config or SettlingConfig()
     start = {part.name: np.asarray(part.T_scene_root, float) for part in tree.components if not part.static}
     held: dict[str, Motion] = {}
+    depths: dict[str, float] = {}
     poses = dict(start)
     for _ in range(config.rounds):
         if len(held) == len(start):
             break
-        found = _simulated(tree, held, config)
+        found, depths = _simulated(tree, held, config)
         motions = {name: _motion(tree.by_name[name], start[name], T) for name, T in found.items()}
         far = {n: m for n, m in motions.items() if not (m.shift <= config.shift and m.turn <= config.turn)}
         poses = {**start, **{name: T for name, T in found.items() if name not in far}}
@@ -96,11 +101,13 @@ def settle(tree: BodyTree, config: SettlingConfig | None = None) -> Settled:
             break
     parts = {part.name: part for part in tree.components}
     kept = {name: T if _moved(parts[name], start[name], T) > config.rest else start[name] for name, T in poses.items()}
-    return Settled(kept, held)
+    return Settled(kept, held, {name: depths[name] for name in start if depths.get(name, 0.0) > config.depth})
 
 
-def _simulated(tree: BodyTree, held: Collection[str], config: SettlingConfig) -> dict[str, Float64]:
-    """Free components that are not held -> (4, 4) T_scene_root at rest."""
+def _simulated(
+    tree: BodyTree, held: Collection[str], config: SettlingConfig
+) -> tuple[dict[str, Float64], dict[str, float]]:
+    """Free components that are not held -> (4, 4) T_scene_root at rest; all -> metres that they are in others."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -121,9 +128,15 @@ def _simulated(tree: BodyTree, held: Collection[str], config: SettlingConfig) ->
             data.qvel *= kept
             if step >= LEAST and np.abs(data.qvel).max(initial=0.0) < STILL:
                 break
-    mujoco.mj_kinematics(model, data)
+    mujoco.mj_fwdPosition(model, data)
+    depths: dict[str, float] = {}
+    for contact in data.contact:
+        for geom in contact.geom:
+            name = model.body(int(model.body_rootid[model.geom_bodyid[geom]])).name
+            depths[name] = max(depths.get(name, 0.0), -float(contact.dist))
     states = {part.name: data.body(part.name) for part in free}
-    return {name: transform(state.xmat.reshape(3, 3).copy(), state.xpos.copy()) for name, state in states.items()}
+    poses = {name: transform(state.xmat.reshape(3, 3).copy(), state.xpos.copy()) for name, state in states.items()}
+    return poses, depths
 
 
 def _add_component(

@@ -19,7 +19,7 @@ from simtrack.perception.reconstruction.interference import Contact, Interferenc
 from simtrack.perception.reconstruction.kinematic_tree import FIXED_CLASSES, scaled_mass
 from simtrack.perception.reconstruction.layout import layout_slabs
 from simtrack.perception.reconstruction.selection import best_face, step_onto
-from simtrack.perception.reconstruction.solids import Solid, resting_rise, solid_of
+from simtrack.perception.reconstruction.solids import Solid, compacted, resting_rise, solid_of
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
 from simtrack.perception.scene_graph.contact.nodes import SCENE
 
@@ -138,7 +138,7 @@ class _Snapping:
         self._stack()
         stuck: list[Contact] = []
         if self.order:
-            scene = Interference(self.start)
+            scene = Interference({name: compacted(solid) for name, solid in self.start.items()})
             for _ in range(self.config.rounds):
                 stuck = self._deepest(self._beside(scene.contacts(self.shifts)))
                 if not any(self._push(contact) for contact in stuck):

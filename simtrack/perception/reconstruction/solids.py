@@ -11,6 +11,8 @@ from simtrack.contracts import Float64
 from simtrack.geometry.meshes import Mesh, transformed
 from simtrack.perception.reconstruction.candidates import CadCandidate
 
+COMPACT = 0.8
+"""Share of its hull that the pieces of a compact solid fill."""
 _CLOSE = 1e-6
 """Metres: pieces that overlap by less only touch."""
 
@@ -56,6 +58,15 @@ def convex_pieces(candidate: CadCandidate) -> list[tuple[str, Mesh]]:
 def solid_of(candidate: CadCandidate) -> Solid:
     """The pieces of an aligned model."""
     return Solid.of([mesh.vertices for _, mesh in convex_pieces(candidate)])
+
+
+def compacted(solid: Solid) -> Solid:
+    """The hull of a solid that nearly fills it, as a pile of books: what is in it has to come out of all of it."""
+    if len(solid.pieces) == 1:
+        return solid
+    everything = np.concatenate(solid.pieces)
+    filled = sum(float(_manifold(piece).volume()) for piece in solid.pieces)
+    return Solid.of([everything]) if filled > COMPACT * float(_manifold(everything).volume()) else solid
 
 
 def overlap(first: Solid, second: Solid) -> tuple[float, float]:

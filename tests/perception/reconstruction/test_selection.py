@@ -57,6 +57,25 @@ def test_candidates_are_selected_to_stay_out_of_each_other() -> None:
     assert [(first, second) for first, second, _ in only.conflicts] == [("first", "second")]
 
 
+def test_one_in_a_wall_is_no_better_than_one_from_which_a_child_moves_a_little() -> None:
+    graph = corner(
+        table=("table", table_mesh((1.0, 0.6, 0.7), (0.0, 1.69, 0.0))),
+        box=("box", block((0.1, 0.1, 0.1), (0.0, 1.93, 0.7))),
+    )
+    inside, clear = CadCandidate(WIDE, at(0.0, 1.81, 0.35), 1.0), CadCandidate(WIDE, at(0.0, 1.55, 0.35), 1.0)
+    selection = select(graph, {"table": [inside, clear]})
+    assert selection.chosen == {"table": 1}
+    assert selection.lost == {"table": ["box"]}
+    assert selection.homeless == {"table": []}
+
+
+def test_barred_candidates_are_taken_only_where_nothing_else_is_left() -> None:
+    graph = laid_table()
+    offered = {"table": [CadCandidate(WIDE, at(x, 0.0, 0.35), 1.0) for x in (0.0, 0.01)]}
+    assert select(graph, offered, barred={"table": {0}}).chosen == {"table": 1}
+    assert select(graph, offered, barred={"table": {0, 1}}).chosen == {"table": 0}
+
+
 @pytest.mark.parametrize("field", [{"contact_area": 0.0}, {"steps": -1}, {"height": float("nan")}])
 def test_settings_out_of_range_are_refused(field: dict) -> None:
     with pytest.raises(InvalidValueError, match=next(iter(field))):

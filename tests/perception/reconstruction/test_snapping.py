@@ -8,16 +8,21 @@ from simtrack.objects.cad.builder import ModelBuilder
 from simtrack.objects.cad.materials import CERAMIC
 from simtrack.objects.cad.model import CadModel
 from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.selection import OVERHANG
 from simtrack.perception.reconstruction.snapping import eq1_residuals, snap
 from simtrack.perception.reconstruction.solids import overlap, solid_of
 
 TABLE = table_model("table-test", (1.0, 0.6, 0.7))
 
 
+def slab(size: tuple[float, float, float]) -> CadModel:
+    builder = ModelBuilder("box", "slab")
+    builder.part().block((0.0, 0.0, 0.0), size, CERAMIC)
+    return builder.finish("box-slab")
+
+
 def cube(side: float) -> CadModel:
-    builder = ModelBuilder("box", "cube")
-    builder.part().block((0.0, 0.0, 0.0), (side, side, side), CERAMIC)
-    return builder.finish("box-cube")
+    return slab((side, side, side))
 
 
 def test_heights_follow_the_models_from_the_floor_upwards() -> None:
@@ -89,3 +94,38 @@ def test_what_hangs_touches_its_wall() -> None:
     assert graph.parent("picture") == "wall"
     snapped = snap(graph, {"picture": CadCandidate(cube(0.3), at(0.0, 1.8, 1.5), 1.0)})
     assert solid_of(snapped.candidates["picture"]).high[:, 1].max() == pytest.approx(2.0, abs=1e-3)
+
+
+def test_what_stood_on_top_of_another_stands_on_top_of_its_thicker_model() -> None:
+    """A book across two: the models of the lower ones differ in height by more than half of the upper one's."""
+    graph = corner(
+        left=("book", block((0.15, 0.2, 0.03), (-0.1, 0.0, 0.0))),
+        right=("book", block((0.15, 0.2, 0.03), (0.1, 0.0, 0.0))),
+        upper=("book", block((0.3, 0.2, 0.02), (0.0, 0.0, 0.03))),
+    )
+    assert set(graph.supporters("upper")) == {"left", "right"}
+    chosen = {
+        name: CadCandidate(slab((0.15, 0.2, height)), at(x, 0.0, height / 2), 1.0)
+        for name, x, height in (("left", -0.1, 0.02), ("right", 0.1, 0.05))
+    }
+    chosen["upper"] = CadCandidate(slab((0.3, 0.2, 0.02)), at(0.0, 0.0, 0.04), 1.0)
+    snapped = snap(graph, chosen)
+    assert solid_of(snapped.candidates["upper"]).bottom == pytest.approx(0.05, abs=1e-6)
+    assert snapped.stuck == []
+
+
+def test_neighbours_at_an_edge_are_not_pushed_off_it() -> None:
+    graph = corner(
+        table=("table", table_mesh((1.0, 0.6, 0.7), (0.0, 0.0, 0.0))),
+        box=("box", block((0.2, 0.2, 0.2), (0.25, 0.0, 0.7))),
+        cup=("cup", block((0.08, 0.08, 0.08), (0.42, 0.0, 0.7))),
+    )
+    chosen = {
+        "table": CadCandidate(TABLE, at(0.0, 0.0, 0.35), 1.0),
+        "box": CadCandidate(cube(0.2), at(0.35, 0.0, 0.8), 1.0),
+        "cup": CadCandidate(cube(0.1), at(0.46, 0.0, 0.74), 0.8),
+    }
+    snapped = snap(graph, chosen)
+    solids = {name: solid_of(candidate) for name, candidate in snapped.candidates.items()}
+    assert overlap(solids["box"], solids["cup"])[1] < 1.5e-3
+    assert snapped.candidates["cup"].T_map_model[0, 3] < 0.5 - OVERHANG * 0.08 + 1e-3
