@@ -5,9 +5,10 @@ import json
 import logging
 import os
 import tempfile
+import threading
 import zipfile
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -22,6 +23,8 @@ from simtrack.objects.model import ObjectModel, Symmetries, SymmetryAxis
 _log = logging.getLogger("simtrack.cache")
 UNUSABLE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
 """What a file may raise that is missing, damaged or of another version."""
+_reading = threading.Lock()
+"""CPython 3.11 before 3.11.8 may fail while two threads parse Python, which numpy does to read the head of an array."""
 _SCALARS = ("name", "semantic_class", "mass", "friction", "diameter", "trackable", "description")
 _ARRAYS = ("centre_of_mass", "inertia", "extents", "keypoints")
 
@@ -65,7 +68,7 @@ def cached_decimation(name: str, mesh: Mesh, target_faces: int) -> Mesh:
     parts = [mesh.vertices, mesh.faces, *([] if mesh.face_colors is None else [mesh.face_colors])]
     key = digest(*(part.tobytes() for part in parts), str(target_faces).encode())
     path = paths.cache_dir() / "objects" / f"{name}-{target_faces}-{key}.npz"
-    with suppress(*UNUSABLE), path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+    with suppress(*UNUSABLE), open_arrays(path) as data:
         return read_mesh(data, "mesh")
     _log.info("simplifying object models: %s", name)
     mesh = decimate(mesh, target_faces)
@@ -95,6 +98,13 @@ def read_mesh(data: Mapping[str, np.ndarray], label: str) -> Mesh:
     return Mesh(data[f"{label}.vertices"], data[f"{label}.faces"], data.get(f"{label}.colors"))
 
 
+@contextmanager
+def open_arrays(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
+    """What `write_arrays` wrote, read as it is asked for; one thread at a time."""
+    with _reading, path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+        yield data
+
+
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write under another name, then rename: readers see all of the file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -113,8 +123,8 @@ def _numbered(parts: tuple[Mesh, ...]) -> list[tuple[str, Mesh]]:
 
 
 def _read(path: Path) -> ObjectModel:
-    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-        parts = sum(1 for key in data.files if key.startswith("collision") and key.endswith(".faces"))
+    with open_arrays(path) as data:
+        parts = sum(1 for key in data if key.startswith("collision") and key.endswith(".faces"))
         return ObjectModel(
             mesh=read_mesh(data, "mesh"),
             visual=read_mesh(data, "visual"),

@@ -71,6 +71,8 @@ def test_ctrl_c_leaves_complete_scenes(recipe: Path, made: Path, tmp_path: Path)
     process = subprocess.Popen(
         [*command, "--workers", "1", "--count", "90"], env=os.environ | {"PYTHONPATH": str(ROOT)}, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+        # Shells have what they run in the background ignore Ctrl-C, and so would all that is started from there.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     while process.poll() is None and not list((out / "scenes").glob("*.json")):
         time.sleep(0.01)

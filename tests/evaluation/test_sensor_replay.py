@@ -133,7 +133,7 @@ def test_views_far_apart_are_compared_but_not_followed(tmp_path: Path) -> None:
 
 def test_a_bop_scene_feeds_the_tracker(tmp_path: Path) -> None:
     brick = transformed(box_mesh(BRICK), brick_pose())
-    world, poses = World(furnished_room(), brick), camera_path(8)
+    world, poses = World(furnished_room(), brick), camera_path(12)
     scene = write_bop(tmp_path / "set", [noisy(world.depth(T), k) for k, T in enumerate(poses)], poses)
     metrics, _ = replayed(scene, tmp_path / "out")
     assert value(metrics, "objects.depth_difference.median") < 0.01

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from simtrack import paths
-from simtrack.objects.cache import UNUSABLE, mesh_arrays, read_mesh, write_arrays
+from simtrack.objects.cache import UNUSABLE, mesh_arrays, open_arrays, read_mesh, write_arrays
 from simtrack.objects.cad.model import CadBox, CadJoint, CadModel, CadPart, CadPlane, CadSupport
 
 _log = logging.getLogger("simtrack.cache")
@@ -18,7 +18,7 @@ _log = logging.getLogger("simtrack.cache")
 def cached_models(label: str, key: str, build: Callable[[], tuple[CadModel, ...]]) -> tuple[CadModel, ...]:
     """The models kept under `label` and `key`, else built and kept; a cache that cannot be used is no error."""
     path = paths.cache_dir() / "cad" / f"{label}-{key}.npz"
-    with suppress(*UNUSABLE), path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+    with suppress(*UNUSABLE), open_arrays(path) as data:
         return unpacked(data)
     _log.info("building CAD models: %s", label)
     models = build()

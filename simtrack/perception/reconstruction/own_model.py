@@ -14,7 +14,7 @@ from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError, MeshError
 from simtrack.geometry.meshes import Mesh, concatenate, convex_hull, decimate, transformed
 from simtrack.geometry.transforms import inverse, transform
-from simtrack.objects.cache import UNUSABLE, digest, mesh_arrays, read_mesh, write_arrays
+from simtrack.objects.cache import UNUSABLE, digest, mesh_arrays, open_arrays, read_mesh, write_arrays
 from simtrack.objects.cad.model import CadModel, CadPart, CadSupport
 from simtrack.objects.decomposition import DecompositionConfig, convex_parts
 from simtrack.perception.reconstruction.candidates import CadCandidate
@@ -101,8 +101,8 @@ def _decomposed(mesh: Mesh, node: EntityNode) -> tuple[Sequence[Mesh], str]:
     """Convex parts of a mesh, from the disk cache if it was decomposed before; its hull, and why, if that fails."""
     key = digest(mesh.vertices.tobytes(), mesh.faces.tobytes(), repr((DECOMPOSITION, FACES)).encode())
     path = paths.cache_dir() / "convex" / f"{key}.npz"
-    with suppress(*UNUSABLE), path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-        return [read_mesh(data, f"part{k}") for k in range(len(data.files) // 2)], ""
+    with suppress(*UNUSABLE), open_arrays(path) as data:
+        return [read_mesh(data, f"part{k}") for k in range(len(data) // 2)], ""
     try:
         parts = convex_parts(mesh, node.name, DECOMPOSITION, max_faces=FACES, time_limit=TIME_LIMIT)
     except MeshError as error:

@@ -3,9 +3,6 @@
 import hashlib
 import json
 import logging
-import os
-import tempfile
-import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.metadata import version
@@ -17,6 +14,7 @@ import numpy as np
 from simtrack import paths
 from simtrack.contracts import Float64, MapEntity, Room, StaticMap
 from simtrack.geometry.meshes import Mesh
+from simtrack.objects.cache import UNUSABLE, open_arrays, write_arrays
 from simtrack.simulation.building.parts import StaticPart, StaticWorld
 
 _log = logging.getLogger("simtrack.cache")
@@ -51,43 +49,30 @@ def world_digest(world: StaticWorld, *content: object) -> str:
 def cached_world(key: str, build: Callable[[], StaticWorld]) -> StaticWorld:
     """The world kept under `key`, else built and kept; a cache that cannot be used is no error."""
     path = paths.cache_dir() / "buildings" / f"{key}.npz"
-    with suppress(OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+    with suppress(*UNUSABLE):
         return _unpack_world(_read(path))
     _log.info("building the office floor")
     world = build()
     with suppress(OSError):
-        _write(path, _pack_world(world))
+        write_arrays(path, _pack_world(world))
     return world
 
 
 def cached_map(key: str, build: Callable[[], StaticMap]) -> StaticMap:
     """The survey kept under `key`, else made and kept; a cache that cannot be used is no error."""
     path = paths.cache_dir() / "surveys" / f"{key}.npz"
-    with suppress(OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+    with suppress(*UNUSABLE):
         return _unpack_map(_read(path))
     _log.info("surveying the building")
     static_map = build()
     with suppress(OSError):
-        _write(path, _pack_map(static_map))
+        write_arrays(path, _pack_map(static_map))
     return static_map
 
 
 def _read(path: Path) -> Arrays:
-    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-        return {name: data[name] for name in data.files}
-
-
-def _write(path: Path, arrays: Arrays) -> None:
-    """Write under another name, then rename: readers see all of the file or none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
-        Path(temporary).replace(path)
-    except OSError:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with open_arrays(path) as data:
+        return dict(data)
 
 
 # ----------------------------------------------------------------------------------------- ragged lists as flat arrays

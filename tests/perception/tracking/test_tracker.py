@@ -170,7 +170,7 @@ RAISES = """
 from tests.perception.tracking.test_tracker import Film
 film = Film("relay")
 film.put("relay", 0.0, 0.0, 0.0)
-while film.tracker._claims._current is None:
+while not film.tracker._claims._working:
     film.run(1)
 raise RuntimeError("in the middle")
 """
