@@ -1,7 +1,7 @@
 """Detections that need a registration of their own: of a new object, or of a known one that they see otherwise.
 
 Such a registration tries many starts and takes longer than a frame lasts. It is done beside the frames
-(`simtrack.perception.beside`); answers are taken up in the order of the claims, one a frame.
+(`simtrack.perception.beside`); answers are taken up in the order of the claims.
 """
 
 from collections import deque
@@ -42,7 +42,7 @@ class Claim:
         return T[:3, 3]
 
 
-AT_WORK = 4
+AT_WORK = 8
 """Claims that are handed to the thread at most; it works at one after the other."""
 
 

@@ -22,7 +22,7 @@ class TrackerConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     buffer: float = 0.8
     """Depth images are kept this long for late detections, seconds."""
-    claim_time: float = 0.06
+    claim_time: float = 0.03
     """A detection of something new, or that contradicts a track, is registered beside the frames for this long,
     seconds of the sensor's clock."""
     confirm_detections: int = 2

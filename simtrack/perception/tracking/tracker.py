@@ -247,9 +247,8 @@ class ObjectTracker:
                     self._claims.add(Claim(group, view, None))
 
     def _settle_claims(self, now: int) -> None:
-        """Take the answer to the first claim whose time is up, and begin with the next ones."""
-        settled = self._claims.settle(now)
-        if settled is not None:
+        """Take the answers to the claims whose time is up, and begin with the next ones."""
+        while (settled := self._claims.settle(now)) is not None:
             claim, candidate = settled
             if candidate is not None and claim.target is None:
                 self._bear(claim, candidate)
