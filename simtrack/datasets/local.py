@@ -102,8 +102,7 @@ def _cause(code: int | None) -> str:
 
 def _work(connection: Connection, task: bytes, parent: int) -> None:
     """Make the scenes that are asked for until the connection is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent decides
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    follow_parent()
     if os.getppid() != parent:
         return
     factory, writers = pickle.loads(task)
@@ -115,6 +114,12 @@ def _work(connection: Connection, task: bytes, parent: int) -> None:
                 connection.send(event)
     except (EOFError, BrokenPipeError):
         return
+
+
+def follow_parent() -> None:
+    """Have this process end with its parent, and leave Ctrl-C, which reaches all processes, to it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def thread_limits(threads: int) -> dict[str, str]:

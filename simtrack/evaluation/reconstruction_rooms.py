@@ -6,7 +6,6 @@ The outcome of a room is kept in a file as soon as it is there; those of other c
 import hashlib
 import json
 import multiprocessing
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import simtrack
+from simtrack.datasets.local import follow_parent
 from simtrack.errors import InvalidValueError, SimtrackError
 from simtrack.evaluation.metrics import Metrics, write_atomically
 from simtrack.evaluation.reconstruction import (
@@ -146,7 +146,7 @@ def _results(tasks: Sequence[RoomTask], workers: int) -> Iterator[tuple[RoomTask
     """Tasks with what came of them, as they end; workers are ended at once when the caller stops."""
     if not tasks:
         return
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _ignore_interrupts)
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), follow_parent)
     try:
         running: dict[Future[RoomOutcome], RoomTask] = {pool.submit(task.run): task for task in tasks}
         while running:
@@ -163,11 +163,6 @@ def _results(tasks: Sequence[RoomTask], workers: int) -> Iterator[tuple[RoomTask
         for process in multiprocessing.active_children():
             process.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _ignore_interrupts() -> None:
-    """Ctrl-C reaches all processes; the parent decides."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def table_5(outcomes: Sequence[RoomOutcome]) -> tuple[list[str], list[list[str]]]:
