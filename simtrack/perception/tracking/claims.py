@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from simtrack.contracts import Float64, PoseHypothesis
+from simtrack.contracts import NANOSECONDS, Float64, PoseHypothesis
 from simtrack.perception.beside import Beside, worker
 from simtrack.perception.tracking.birth import Occluders, Prober
 from simtrack.perception.tracking.follow_up import Candidate
@@ -54,6 +54,8 @@ class ClaimQueue:
         self._prober, self._models, self._config = prober, models, config
         self._waiting: deque[Claim] = deque()
         self._working: deque[tuple[Claim, Beside[Candidate | None]]] = deque()
+        self._free = 0
+        """Stamp at which the thread is taken to be done with what it has, nanoseconds."""
         self._thread = worker("claims")
 
     def add(self, claim: Claim) -> None:
@@ -85,7 +87,8 @@ class ClaimQueue:
             claim = self._waiting.popleft()
             if claim.view.stamp < oldest or (claim.target is not None and not claim.target.alive):
                 continue
-            beside = Beside[Candidate | None](self._thread, self._config.claim_time)
+            self._free = max(self._free, stamp) + round(self._config.claim_time * NANOSECONDS)
+            beside = Beside[Candidate | None](self._thread, (self._free - stamp) / NANOSECONDS)
             beside.begin(stamp, partial(self._candidate, claim, views(claim)))
             self._working.append((claim, beside))
 

@@ -51,7 +51,7 @@ class RegistrationConfig:
         Step(gate=0.006, kernel=3.0, edge_reach=5, repeats=2),
     )
     """Outer iterations from a prediction, as of a track."""
-    near: Step = field(default=Step(gate=0.008, kernel=4.0, edge_reach=5, repeats=2, silhouettes="always"))
+    near: Step = field(default=Step(gate=0.008, kernel=4.0, edge_reach=5, silhouettes="always"))
     """What a track is tried with first: most predictions are so good that wide gates would only lead away from them."""
     finish: Step | None = field(default=Step(gate=0.006, kernel=3.0, edge_reach=5, fine=True))
     """How a track ends, near or not: a single cast at full resolution, from a pose that leaves little to be moved."""
@@ -63,6 +63,8 @@ class RegistrationConfig:
     """... and not further than this from the prediction, metres of surface."""
     inner_iterations: int = 3
     """Solver steps on the same correspondences (the paper: 10 Umeyama fits)."""
+    last_step: float = 1e-5
+    """... of which one that is shorter than this is the last, metres of surface."""
     tolerance: float = 5e-5
     """An instance that an outer iteration moves by less than this has converged, metres of surface, ..."""
     insignificant: float = 0.3
