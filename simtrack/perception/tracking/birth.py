@@ -1,6 +1,6 @@
 """From a detection's pose hypotheses to a registered candidate: depth alignment, registration, comparison of fits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -96,7 +96,7 @@ class Prober:
         probe = replace(registration, schedule=schedule)
         self._fit = fit
         self._coarse = [replace(step, repeats=1, coarsen=2) for step in schedule[:5]]
-        self._refine = schedule[3:]
+        self._refine = [replace(step, repeats=min(step.repeats, 2)) for step in schedule[3:]]
         self._follow = registration.track_schedule
         self._narrow = [replace(step, repeats=2, coarsen=2) for step in registration.track_schedule]
         self._registration = Registration(probe)
@@ -106,6 +106,10 @@ class Prober:
     def close(self) -> None:
         """Release the scene's memory."""
         self._registration.close()
+
+    def count_casts(self, on_cast: Callable[[], None] | None) -> None:
+        """Have a function called before every cast from now on."""
+        self._registration.on_cast = on_cast
 
     def best(
         self,

@@ -6,7 +6,7 @@ or by the paper's Umeyama fits. Directions that the data do not constrain are fo
 moved.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,6 +81,8 @@ class Registration:
         self._marks = kernels.no_marks(0, 0)
         """Where the casts of a track have hit something, or nearly: a fine one needs no other rays."""
         self._points, self._edges = kernels.Points.room(0), kernels.Edges.room(0)
+        self.on_cast: Callable[[], None] | None = None
+        """Called before every cast."""
 
     def add(self, instance: int, model: TrackedModel) -> None:
         """Put an instance of a model into the scene."""
@@ -221,6 +223,8 @@ class Registration:
 
     def _cast(self, batch: "_Batch", strides: npt.NDArray[np.int64], marked: bool = False) -> tuple[RayBundle, RayHits]:
         """Cast the rays of the active instances' windows, on pixel grids (K,), or those that are marked."""
+        if self.on_cast is not None:
+            self.on_cast()
         windows, grids = batch.windows[batch.active], strides[batch.active]
         if marked:
             bundle = RayBundle.from_pixels(batch.intrinsics, kernels.take_marked(self._marks, *batch.depth.shape))

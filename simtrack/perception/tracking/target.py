@@ -23,9 +23,9 @@ class TrackerConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     buffer: float = 0.8
     """Depth images are kept this long for late detections, seconds."""
-    claim_time: float = 0.04
-    """A detection of something new, or that contradicts a track, is registered beside the frames for this long,
-    seconds of the sensor's clock."""
+    cast_time: float = 0.00075
+    """A detection of something new, or that contradicts a track, is registered beside the frames; each of the casts
+    that this needs is taken to last so long, seconds of the sensor's clock."""
     confirm_detections: int = 2
     """Detections that a new object needs before it is believed; one is enough where the fit leaves no doubt."""
     confirm_frames: int = 3
