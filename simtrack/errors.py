@@ -72,3 +72,11 @@ class DatasetError(SimtrackError):
 
 class QueryError(SimtrackError):
     """A scene-graph query that cannot be parsed or names unknown things."""
+
+
+class StageError(SimtrackError):
+    """A stage of somebody else's that cannot be loaded or built: names the stage, what was given, and the reason."""
+
+    def __init__(self, stage: str, given: str, reason: str) -> None:
+        self.stage, self.given, self.reason = stage, given, reason
+        super().__init__(f"{stage} '{given}': {reason}")

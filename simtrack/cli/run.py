@@ -16,7 +16,10 @@ def run(
     seed: int = 0,
     out: Path | None = None,
     agent: str | None = None,
+    tracker: str | None = None,
+    localizer: str | None = None,
     detector: str = "oracle",
+    stage_limit: float = 5.0,
     renderer: Literal["mujoco", "embree"] = "mujoco",
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     compare_gaze: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
@@ -33,7 +36,10 @@ def run(
         seed: Of everything random.
         out: Folder for the results; runs/SCENE-SEED if not given.
         agent: What decides where the robot looks and drives: explorer, fixed-gaze, route; the scene's own if not given.
-        detector: What detects objects in images.
+        tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
+        localizer: A localizer of yours, package.module:Class.
+        detector: What detects objects in images: oracle, or package.module:Class.
+        stage_limit: Seconds that a stage of yours has for a frame; after that the frame counts as missed.
         renderer: mujoco needs OpenGL (EGL), embree needs none.
         overwrite: Replace the results in an existing folder.
         compare_gaze: Run the fixed gaze on the same seed, too: what does the agent's gaze gain?
@@ -57,6 +63,7 @@ def run(
     config = RunConfig(
         scene=loaded, out=folder, duration=duration, seed=seed, agent=agent, detector=detector, renderer=renderer,
         overwrite=overwrite, log=log, compare_gaze=compare_gaze, threads=threads,
+        tracker=tracker, localizer=localizer, stage_limit=stage_limit,
     )  # fmt: skip
     observers = _observers(view, rrd)
     with console.ProgressLine(f"{loaded.name} · seed {seed}") as line, cold_start_told(line.say):
@@ -102,3 +109,8 @@ def _summarise(record: "RunRecord") -> None:
     if console.out().width < 90:
         columns, rows = columns[:4], [row[:4] for row in rows]
     console.show_table(columns, rows, right=(1, 2, 4))
+    for name, metric in record.metrics.items():
+        if name.endswith(".missed_frames") and metric.value:
+            stage = name.split(".")[1]
+            told = f"the {stage} missed {metric.value} frames: {metric.reason} (see faults.csv)"
+            console.show_warning(told, UserWarning, "", 0)

@@ -30,6 +30,7 @@ from simtrack.contracts import (
 )
 from simtrack.errors import InvalidValueError
 from simtrack.evaluation.evaluator import Evaluator, pose_scorers, true_models
+from simtrack.evaluation.foreign_stages import fault_metrics, foreign_stages, write_faults
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
 from simtrack.evaluation.record import RelationTimeline, RunRecord, graph_name
 from simtrack.evaluation.run_config import FIXED_GAZE, RunConfig
@@ -38,6 +39,7 @@ from simtrack.evaluation.start_up import warm_up
 from simtrack.evaluation.tracking import TrackingEvaluator
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.objects import ObjectModel
+from simtrack.perception.foreign import StageContext, Watch
 from simtrack.perception.pipeline import PerceptionStack
 from simtrack.simulation.agents import AgentContext, make_agent
 from simtrack.simulation.oracles import OracleDetector
@@ -143,6 +145,8 @@ class Loop:
     agent: Agent
     start: Command
     """Held until the agent gives the first one."""
+    watches: Sequence[Watch] = ()
+    """Of the stages that are not simtrack's."""
 
     def drive(
         self, seconds: float, clock: Clock, log: "McapWriter | None" = None
@@ -186,16 +190,20 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
         start = Command(head_pan=robot.head_pan, head_tilt=robot.head_tilt, torso=robot.torso)
         rng = stream(config.seed, "agent")
         context = AgentContext(simulation.static_map, simulation.robot, simulation.camera.intrinsics, start, rng)
+        parts = StageContext(simulation.models, simulation.static_map, simulation.robot, simulation.start)
+        foreign = exits.enter_context(foreign_stages(config, parts))
         stack = PerceptionStack(
             simulation.static_map,
             simulation.models,
             simulation.robot,
-            OracleDetector(simulation.truth, simulation.models, config.seed),
+            foreign.detector or OracleDetector(simulation.truth, simulation.models, config.seed),
             T_map_base=simulation.start,
             config=config.stack,
+            localizer=foreign.localizer,
+            tracker=foreign.tracker,
         )
         exits.callback(stack.close)
-        yield Loop(simulation, stack, make_agent(agent, context), start)
+        yield Loop(simulation, stack, make_agent(agent, context), start, foreign.watches)
 
 
 @dataclass(slots=True)
@@ -255,6 +263,8 @@ class ClosedLoopRun:
             self._partial = stop.asked
             record = self._record(loop, evaluator)
             folder.write_metrics(record.metrics)
+            if loop.watches:
+                write_faults(folder.path / "faults.csv", [fault for watch in loop.watches for fault in watch.faults])
             folder.write_graph(loop.stack.graph.to_json())
         return record
 
@@ -275,7 +285,7 @@ class ClosedLoopRun:
                 observer.frame(frame, belief)
             if loop.simulation.now - saved >= SAVE_PERIOD:
                 saved = loop.simulation.now
-                folder.write_metrics(self._metrics(evaluator))
+                folder.write_metrics(self._metrics(evaluator, loop.watches))
                 folder.write_graph(loop.stack.graph.to_json())
             if stop.asked:
                 return
@@ -320,11 +330,12 @@ class ClosedLoopRun:
 
     # ---------------------------------------------------------------------------------------------------------- results
 
-    def _metrics(self, evaluator: Evaluator) -> Metrics:
+    def _metrics(self, evaluator: Evaluator, watches: Sequence[Watch]) -> Metrics:
         stamps = evaluator.trajectory.stamps
         return {
             **evaluator.metrics(),
             **self._speed(),
+            **fault_metrics(watches),
             "loop.gaze_gain": self._gain,
             "run.partial": measured(self._partial, "1"),
             "run.images": measured(self._images, "1"),
@@ -360,7 +371,7 @@ class ClosedLoopRun:
             start=0,
             end=trajectory.stamps[-1] if trajectory.stamps else 0,
             partial=self._partial,
-            metrics=self._metrics(evaluator),
+            metrics=self._metrics(evaluator, loop.watches),
             stamps=trajectory.stamps,
             estimated=trajectory.estimated,
             true=trajectory.true,

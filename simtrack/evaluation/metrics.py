@@ -23,7 +23,7 @@ class Metric:
     unit: str
     """``m``, ``rad``, ``s``, ``Hz``, ``bytes``, ``1`` for shares and counts."""
     reason: str = ""
-    """Why there is no value."""
+    """Why there is no value; or a remark on the one that there is."""
 
 
 Metrics: TypeAlias = dict[str, Metric]

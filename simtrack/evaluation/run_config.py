@@ -7,11 +7,14 @@ from pathlib import Path
 
 import simtrack
 from simtrack.errors import InvalidValueError, UnknownNameError
+from simtrack.perception.foreign import check_stage
+from simtrack.perception.foreign.guards import DEFAULT_LIMIT
 from simtrack.perception.pipeline import StackConfig
 from simtrack.simulation.agents import AGENTS
 from simtrack.simulation.scene_file import SceneFile
 
-DETECTORS = ("oracle",)
+ORACLE = "oracle"
+"""The detector that knows the truth, and errs like a trained network."""
 RENDERERS = ("mujoco", "embree")
 DEFAULT_AGENT, FIXED_GAZE = "explorer", "fixed-gaze"
 _PACKAGES = ("mujoco", "numpy", "numba", "embreex", "opencv-python-headless", "scipy", "pyoxigraph")
@@ -28,7 +31,14 @@ class RunConfig:
     seed: int = 0
     agent: str | None = None
     """The scene's own, or the explorer, if None."""
-    detector: str = "oracle"
+    detector: str = ORACLE
+    """The oracle, or ``package.module:Class``."""
+    tracker: str | None = None
+    """``package.module:Class`` or ``exec:program``; simtrack's own if None."""
+    localizer: str | None = None
+    """``package.module:Class``; simtrack's own if None."""
+    stage_limit: float = DEFAULT_LIMIT
+    """Seconds of the wall clock that a stage of somebody else's has for a frame."""
     renderer: str = "mujoco"
     overwrite: bool = False
     log: Path | None = None
@@ -46,16 +56,27 @@ class RunConfig:
             raise InvalidValueError("seed", self.seed, "0 or a positive integer")
         for kind, name, known in (
             ("renderer", self.renderer, RENDERERS),
-            ("detector", self.detector, DETECTORS),
             ("agent", self.agent_name, AGENTS),
         ):
             if name not in known:
                 raise UnknownNameError(kind, name, known)
+        if ":" not in self.detector and self.detector != ORACLE:
+            raise UnknownNameError("detector", self.detector, (ORACLE, "package.module:Class"))
+        if not 0.0 < self.stage_limit <= 3600.0:
+            raise InvalidValueError("stage_limit", self.stage_limit, "more than 0 and at most 3600 seconds")
+        for stage, given in self.foreign.items():
+            check_stage(stage, given)
 
     @property
     def seconds(self) -> float:
         """Simulated seconds."""
         return self.duration if self.duration is not None else self.scene.duration
+
+    @property
+    def foreign(self) -> dict[str, str]:
+        """Stage -> what was given for it, of those that are not simtrack's."""
+        given = {"tracker": self.tracker, "localizer": self.localizer, "detector": self.detector}
+        return {stage: name for stage, name in given.items() if name is not None and name != ORACLE}
 
     @property
     def agent_name(self) -> str:
@@ -70,6 +91,9 @@ class RunConfig:
             "duration": self.seconds,
             "agent": self.agent_name,
             "detector": self.detector,
+            "tracker": self.tracker,
+            "localizer": self.localizer,
+            "stage_limit": self.stage_limit,
             "renderer": self.renderer,
             "threads": self.threads,
             "scene_file": plain(self.scene.model_dump(mode="json")),
