@@ -18,12 +18,14 @@ from simtrack.cli.reconstruct import reconstruct
 from simtrack.cli.replay import replay
 from simtrack.cli.run import run
 from simtrack.cli.scenes import scenes
+from simtrack.cli.score import score
 from simtrack.cli.trials import trials
 from simtrack.cli.validate import validate
 
 VERBS = {
     "run": run,
     "replay": replay,
+    "score": score,
     "env": env,
     "generate": generate,
     "inspect": inspect,

@@ -256,7 +256,7 @@ class ClosedLoopRun:
                     objects = evaluator.observe(frame, belief)
                     if belief is not None and evaluator.advanced:
                         estimates.add(belief)
-                        truths.add(self._images - 1, belief, evaluator.trajectory.true[-1], objects)
+                        truths.add(len(evaluator.trajectory.stamps) - 1, belief, evaluator.trajectory.true[-1], objects)
                         self._remember(belief)
             if config.compare_gaze and not stop.asked:
                 self._compare(evaluator, stop)

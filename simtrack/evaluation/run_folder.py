@@ -20,6 +20,7 @@ import numpy as np
 from simtrack.contracts import Belief, Float64, StaticMap
 from simtrack.errors import InvalidValueError, OutputExistsError
 from simtrack.evaluation.metrics import Metric, write_atomically, write_metrics
+from simtrack.evaluation.run_truth import object_ids
 from simtrack.evaluation.tracking import ObjectFrame
 from simtrack.geometry.transforms import quaternion_from_rotation
 
@@ -141,14 +142,14 @@ class TruthTables(_Tables):
     def __init__(self, folder: Path, scene: str, classes: Iterable[str]) -> None:
         """`classes`: names of the catalogue objects; BOP's object ids number them in alphabetical order from 1."""
         super().__init__()
-        self._object_ids = {name: number for number, name in enumerate(sorted(set(classes)), start=1)}
+        self._object_ids = object_ids(classes)
         self._trajectory = self._table(folder / "trajectory.csv", TRAJECTORY)
         self._poses = self._table(folder / "poses.csv", POSES)
         # An underscore would end the data set's name for BOP's tools.
         self._bop = self._table(folder / f"simtrack_{scene.replace('_', '')}-test.csv", BOP)
 
     def add(self, image: int, belief: Belief, T_map_base: Float64, objects: Sequence[ObjectFrame]) -> None:
-        """Append one camera stamp: `image` is its running number, `T_map_base` (4, 4) true."""
+        """Append one camera stamp: `image` is its number in ``trajectory.csv`` from 0, `T_map_base` (4, 4) true."""
         localization = belief.localization
         poses = *_pose(T_map_base), *_pose(localization.T_map_base)
         self._trajectory.write([(belief.stamp, localization.status.value, *poses)])
