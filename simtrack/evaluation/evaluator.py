@@ -11,7 +11,9 @@ from types import TracebackType
 import numpy as np
 
 from simtrack.contracts import NANOSECONDS, Belief, LidarScan, RgbdFrame, SensorFrame
+from simtrack.evaluation.consistency import ConsistencyEvaluator
 from simtrack.evaluation.floor import FloorEvaluator, RegistrationFromTruth
+from simtrack.evaluation.identity import IdentityEvaluator
 from simtrack.evaluation.metrics import Metrics
 from simtrack.evaluation.pose_errors import PoseScorer
 from simtrack.evaluation.presegmentation import (
@@ -76,6 +78,8 @@ class Evaluator:
         self._scorers = pose_scorers(models)
         self.trajectory = TrajectoryEvaluator()
         self.tracking = TrackingEvaluator(self._scorers)
+        self.identity = IdentityEvaluator()
+        self.consistency = ConsistencyEvaluator({name: model.symmetries for name, model in models.items()})
         self._register = RegistrationFromTruth(simulation.models, config.tracker.registration)
         self.floor = FloorEvaluator(self._register, self._scorers)
         self.relations = RelationEvaluator(models, config.scene_graph.relations)
@@ -111,6 +115,9 @@ class Evaluator:
         truth, visibility = self._truth.at(belief.stamp), self._truth.visibility(belief.stamp)
         self.trajectory.observe(belief.stamp, belief.localization, truth.T_map_base)
         objects = self.tracking.observe(belief.tracks, truth, {name: v.fraction for name, v in visibility.items()})
+        self.identity.observe(objects, belief.tracks)
+        self.consistency.observe_robot(belief.localization, truth.T_map_base)
+        self.consistency.observe_objects(objects, {name: o.T_map_object for name, o in truth.objects.items()})
         self.found.see(belief.stamp, {name: v.pixels for name, v in visibility.items()})
         if self._due("objects", belief.stamp):
             self.relations.observe(belief.relations, objects, truth)
@@ -166,7 +173,8 @@ class Evaluator:
     def metrics(self) -> Metrics:
         """All that was measured so far, speed apart."""
         parts = (
-            self.trajectory, self.tracking, self.floor, self.relations, self.found, *self.presegmentation.values()
+            self.trajectory, self.tracking, self.identity, self.consistency, self.floor, self.relations, self.found,
+            *self.presegmentation.values(),
         )  # fmt: skip
         return {name: metric for part in parts for name, metric in part.metrics().items()}
 

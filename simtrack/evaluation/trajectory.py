@@ -68,6 +68,9 @@ class TrajectoryEvaluator:
             metrics[f"localization.{name}_max"] = measured(errors.max(), unit) if errors.size else empty
         translation, rotation = relative_errors(self.stamps, self.estimated, self.true)
         missing = "the run was shorter than a second"
+        for name, unit, errors in (("translation", "m", translation), ("rotation", "rad", rotation)):
+            found = measured(rmse(errors), unit) if errors.size else unmeasured(unit, missing)
+            metrics[f"localization.rpe.{name}.rmse"] = found
         metrics["localization.rpe.translation.median"] = quantile(translation, 0.5, "m", missing)
         metrics["localization.rpe.rotation.median"] = quantile(rotation, 0.5, "rad", missing)
         steps = np.diff([T[:2, 3] for T in self.true], axis=0) if len(self.true) > 1 else np.zeros((0, 2))
