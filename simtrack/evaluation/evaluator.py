@@ -11,6 +11,7 @@ from types import TracebackType
 import numpy as np
 
 from simtrack.contracts import NANOSECONDS, Belief, LidarScan, RgbdFrame, SensorFrame
+from simtrack.evaluation.bop_recall import BopRecall
 from simtrack.evaluation.consistency import ConsistencyEvaluator
 from simtrack.evaluation.floor import FloorEvaluator, RegistrationFromTruth
 from simtrack.evaluation.identity import IdentityEvaluator
@@ -79,6 +80,7 @@ class Evaluator:
         self.trajectory = TrajectoryEvaluator()
         self.tracking = TrackingEvaluator(self._scorers)
         self.identity = IdentityEvaluator()
+        self.bop = BopRecall(models, self._scorers)
         self.consistency = ConsistencyEvaluator({name: model.symmetries for name, model in models.items()})
         self._register = RegistrationFromTruth(simulation.models, config.tracker.registration)
         self.floor = FloorEvaluator(self._register, self._scorers)
@@ -122,6 +124,7 @@ class Evaluator:
         if self._due("objects", belief.stamp):
             self.relations.observe(belief.relations, objects, truth)
             self.floor.observe(frame, objects)
+            self.bop.observe(frame, objects)
         self._see_camera(belief)
         self._see_lidar(belief)
         self.album.see(frame, belief, objects)
@@ -173,8 +176,8 @@ class Evaluator:
     def metrics(self) -> Metrics:
         """All that was measured so far, speed apart."""
         parts = (
-            self.trajectory, self.tracking, self.identity, self.consistency, self.floor, self.relations, self.found,
-            *self.presegmentation.values(),
+            self.trajectory, self.tracking, self.identity, self.consistency, self.bop, self.floor, self.relations,
+            self.found, *self.presegmentation.values(),
         )  # fmt: skip
         return {name: metric for part in parts for name, metric in part.metrics().items()}
 
@@ -182,6 +185,7 @@ class Evaluator:
         """Release ray scenes."""
         self._register.close()
         self._surfaces.close()
+        self.bop.close()
 
     def __enter__(self) -> "Evaluator":
         return self

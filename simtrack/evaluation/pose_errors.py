@@ -163,7 +163,8 @@ class PoseScorer:
         return len(self.symmetries.axes) > 0 or len(self.symmetries.discrete) > 1
 
     @cached_property
-    def _queries(self) -> Float64:
+    def queries(self) -> Float64:
+        """(Q, 3), the points that are measured."""
         stride = -(-len(self.points) // self.max_queries)
         return np.ascontiguousarray(self.points[::stride], dtype=float)
 
@@ -176,8 +177,8 @@ class PoseScorer:
     def add(self, T_est: Float64, T_true: Float64) -> float:
         """ADD, or ADD-S for symmetric objects."""
         if self.symmetric:
-            return add_s(T_est, T_true, self._queries, self._tree)
-        return add(T_est, T_true, self._queries)
+            return add_s(T_est, T_true, self.queries, self._tree)
+        return add(T_est, T_true, self.queries)
 
     def errors(self, T_est: Float64, T_true: Float64) -> tuple[float, float]:
         """Translation error and rotation error (radians) against the closest equivalent of the true pose."""
