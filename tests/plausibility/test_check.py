@@ -139,6 +139,21 @@ def test_a_door_that_meets_other_furniture_is_noted_with_how_far_it_goes(tmp_pat
         assert result.joints[0].blocked_by == "wall"
 
 
+def test_a_door_before_which_something_stands_is_obstructed_and_not_at_fault(tmp_path: Path) -> None:
+    """Its own object would let it open: so are real rooms. Another part of its own object would be at fault."""
+    good = kitchen()
+    wall = block("wall", (1.0, 0.02, 0.4), 0.5, on("floor", "wall", at(0.0, -0.288, 0.4), "fixed"))
+    report = checked(BodyTree("room", (*good.bodies[:3], wall)), tmp_path)
+    assert report.verdict == "plausible", [str(f) for f in report.findings]
+    assert kinds(report, "hinge", "warning") == {"obstructed"}
+    for result in report.engines:
+        assert (result.joints[0].reached, result.joints[0].reached_alone) == (0.0, 1.0), result.engine
+    slide = BodyJoint("slide", "prismatic", "cabinet", at(0.0, -0.288, 0.0), np.array([0.0, -1.0, 0.0]), 0.0, 0.1)
+    (tmp_path / "own").mkdir()
+    own = checked(BodyTree("room", (*good.bodies[:3], block("tray", (0.5, 0.02, 0.4), 1.0, slide))), tmp_path / "own")
+    assert kinds(own, "hinge") == {"unreachable"}
+
+
 def test_a_drawer_carries_what_stands_in_it(tmp_path: Path) -> None:
     """Things that a moved part carries along do not block it."""
     slide = BodyJoint("slide", "prismatic", "floor", at(0.0, 0.0, 0.3), np.array([0.0, -1.0, 0.0]), 0.0, 0.4, 1.0)

@@ -242,6 +242,7 @@ def _shortlists(
 ) -> dict[str, Sequence[CadCandidate]]:
     """Candidates of every entity but layout, parents before children; its own mesh for what has none."""
     out: dict[str, Sequence[CadCandidate]] = {}
+    lacking: list[str] = []
     entities = [name for name in graph.descendants() if not is_layout(graph.nodes[name])]
     for number, name in enumerate(entities):
         say(f"matching {name}", 0.8 * number / len(entities))
@@ -256,10 +257,13 @@ def _shortlists(
                 notes.append(Note(NoteCode.NO_CANDIDATE, name, message))
         except UnknownNameError:
             found = ()
-            classes = ", ".join(cad_classes())
+            lacking.append(name)
             message = f"there is no model of the class '{node.semantic_class}'; its own mesh stands for it"
-            notes.append(Note(NoteCode.NO_MODEL, name, f"{message} (classes: {classes})"))
+            notes.append(Note(NoteCode.NO_MODEL, name, message))
         out[name] = found or _own(node, notes)
+    if lacking:
+        message = f"there are models of the classes {', '.join(cad_classes())}; see $SIMTRACK_CAD for more"
+        notes.append(Note(NoteCode.NO_MODEL, "", message))
     return out
 
 

@@ -52,8 +52,11 @@ def test_what_has_no_model_is_its_own_mesh_and_that_is_said(laid: Reconstruction
     assert {note.entity: note.code for note in laid.notes} == {
         "gadget": NoteCode.NO_MODEL,
         "cup": NoteCode.NO_CANDIDATE,
+        "": NoteCode.NO_MODEL,
     }
-    assert "gadget" in next(note.message for note in laid.notes if note.code is NoteCode.NO_MODEL)
+    said = {note.entity: note.message for note in laid.notes}
+    assert "'gadget'" in said["gadget"]
+    assert "table" in said[""], "the classes that there are, said once"
 
 
 def test_the_record_tells_which_model_stands_where(laid: Reconstruction) -> None:
