@@ -24,7 +24,7 @@ from simtrack.perception.reconstruction.own_model import is_own, own_candidate
 from simtrack.perception.reconstruction.selection import Rejection, Selection, SelectionConfig, select
 from simtrack.perception.reconstruction.settling import Settled, SettlingConfig, settle
 from simtrack.perception.reconstruction.snapping import Snapped, SnappingConfig, eq1_residuals, snap
-from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_layout
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_far_above, is_layout
 from simtrack.perception.scene_graph.contact.nodes import FLOOR, SCENE, EntityNode
 
 Shortlist = Callable[[EntityNode, ContactGraph, Sequence[CadModel]], Sequence[CadCandidate]]
@@ -156,6 +156,7 @@ def reconstruct(
     attempt = _settled_attempt(graph, shortlists, selection, ground, config, name)
     selection, snapped, chosen = attempt.selection, attempt.snapped, attempt.chosen
     _selection_notes(selection, notes)
+    _held_notes(graph, notes)
     _snapping_notes(graph, snapped, notes)
     _settling_notes(graph, attempt.settled, notes)
     placed = _settled(graph, snapped.candidates, attempt.settled)
@@ -299,6 +300,15 @@ def _own(node: EntityNode, notes: list[Note]) -> Sequence[CadCandidate]:
     if said:
         notes.append(Note(NoteCode.APPROXIMATED, node.name, said))
     return (candidate,)
+
+
+def _held_notes(graph: ContactGraph, notes: list[Note]) -> None:
+    for name, support in graph.supports.items():
+        if is_far_above(graph.nodes[name], support):
+            message = (
+                f"what holds it was not seen, and '{support.parent}' is too far below; it is fixed where it was seen"
+            )
+            notes.append(Note(NoteCode.HELD, name, message))
 
 
 def _selection_notes(selection: Selection, notes: list[Note]) -> None:

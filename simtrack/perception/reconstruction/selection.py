@@ -25,6 +25,8 @@ INNER = 0.8
 """Sides of the part of a child's box, about its middle, that has to be free: models are not exactly alike."""
 OVERHANG = 0.3
 """Share of its width by which the middle of what stands on a face stays away from the face's edge."""
+CLEAR = 0.9
+"""Share of its height that has to be free above a face: boards and drawers are thin, and take little of it."""
 MOST_TAKEN = 0.15
 """Share of it that the model may take."""
 
@@ -48,7 +50,7 @@ class SelectionConfig:
     overlap_depth: float = 0.01
     """How deep two candidates may be in each other: snapping pushes them apart."""
     far_worse: float = 3.0
-    """Times the least alignment error among those that survive, above which a candidate is no better than a conflict."""
+    """Times the least alignment error among those that survive, above which a candidate is not taken."""
     slack: float = 0.01
     """Metres of alignment error that count for nothing in that."""
     steps: int = 200
@@ -245,7 +247,8 @@ def best_face(
             if np.linalg.norm(step) > aside:
                 continue
             moved = OrientedBox(transform(None, step) @ child.T_map_box, child.extents)
-        if contact_share(moved, face) >= least and _has_room(solid, moved, face.height):
+        low = face.clearance < CLEAR * child.extents[2]
+        if not low and contact_share(moved, face) >= least and _has_room(solid, moved, face.height):
             return face
     return None
 

@@ -20,7 +20,7 @@ from simtrack.perception.reconstruction.kinematic_tree import FIXED_CLASSES, sca
 from simtrack.perception.reconstruction.layout import layout_slabs
 from simtrack.perception.reconstruction.selection import best_face, step_onto
 from simtrack.perception.reconstruction.solids import Solid, compacted, resting_rise, solid_of
-from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_far_above, is_layout
 from simtrack.perception.scene_graph.contact.nodes import SCENE
 
 SLACK = 2e-4
@@ -168,7 +168,7 @@ class _Snapping:
             elif support.kind is SupportKind.ROOT:
                 if self.ground is not None:
                     self.shifts[name][2] += self.ground - self._solid(name).bottom
-            else:
+            elif not is_far_above(self.graph.nodes[name], support):
                 self._put_down(name, support.parent, support.height)
             self.rested[name] = self._against(name)
 

@@ -151,15 +151,15 @@ def locker() -> ModelBuilder:
 
 
 def wall_unit() -> ModelBuilder:
-    """Hangs on a wall: a door, and an open bay below it."""
-    b = ModelBuilder("cabinet", "wall unit with a door over an open bay")
-    p, x, y, h = b.part(), 0.225, 0.15, 0.7
+    """Hangs on a wall: one door before a glass shelf."""
+    b = ModelBuilder("cabinet", "wall unit with one door and a glass shelf")
+    p, x, y, h = b.part(), 0.26, 0.16, 0.6
     carcass(p, (-x, x), (-y, y), (0.0, h), 0.016, GREY_BOARD)
-    p.block((-x + 0.016, -y, 0.2), (x - 0.016, y - 0.016, 0.216), GREY_BOARD)
-    b.hollow(p, (-x + 0.016, -y, 0.016), (x - 0.016, y - 0.016, 0.2))
-    b.hollow(p, (-x + 0.016, -y, 0.216), (x - 0.016, y - 0.016, h - 0.016))
+    p.block((-x + 0.016, -y + 0.03, 0.3), (x - 0.016, y - 0.016, 0.306), GLASS)
+    b.hollow(p, (-x + 0.016, -y, 0.016), (x - 0.016, y - 0.016, 0.3))
+    b.hollow(p, (-x + 0.016, -y + 0.03, 0.306), (x - 0.016, y - 0.016, h - 0.016))
     b.support(p, (0.0, 0.0, h), (2 * x, 2 * y))
-    door(b, "door", (-x, x), (0.2, h), -y, "left", WHITE_BOARD, grip=(0.25, 0.4))
+    door(b, "door", (-x, x), (0.0, h), -y, "left", WHITE_BOARD, grip=(0.05, 0.2))
     return b
 
 
