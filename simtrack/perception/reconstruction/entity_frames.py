@@ -19,6 +19,10 @@ UPRIGHT = 0.5
 """|z| of a normal below which a surface stands upright."""
 PARALLEL = float(np.cos(np.radians(12.0)))
 """Between upright surfaces of a carcass and its box; what is turned more is a door that stands open."""
+LEANS = float(np.sin(np.radians(4.0)))
+"""Sine of the angle off upright and off level from which a plane leans."""
+LEVEL, BESIDE = float(np.cos(np.radians(3.0))), 0.1
+"""|z| of the normal of a level plane, and the share of the largest plane's area from which it counts."""
 SLICE = 0.02
 """Metres by which open doors are peeled off."""
 MIDDLE, FILLED = 0.35, 0.1
@@ -35,10 +39,11 @@ CHANGE = 0.05
 def frames(node: EntityNode, graph: ContactGraph) -> tuple[tuple[EntityNode, Float64], ...]:
     """The node as it is compared, and (4, 4) what puts a model that was found so back into the map."""
     assert node.shape is not None
-    if any(lean.child == node.name for lean in graph.leaning):
-        T_back = leaning_turn(node)
-        if T_back is not None:
-            return ((node.moved(inverse(T_back) @ node.T_map_entity), T_back),)
+    T_back = leaning_turn(node) if node.kind is EntityKind.RIGID else None
+    if T_back is not None:
+        righted = node.moved(inverse(T_back) @ node.T_map_entity), T_back
+        leans = any(lean.child == node.name for lean in graph.leaning)
+        return (righted,) if leans else ((node, np.eye(4)), righted)
     if node.kind is EntityKind.ARTICULATED:
         carcass = carcass_box(node)
         if carcass is not None:
@@ -47,16 +52,21 @@ def frames(node: EntityNode, graph: ContactGraph) -> tuple[tuple[EntityNode, Flo
 
 
 def leaning_turn(node: EntityNode) -> Float64 | None:
-    """(4, 4) turn about the middle of its box by which a thing leans, seen by its largest plane; None if by none."""
+    """(4, 4) turn about the middle of its box by which a thing leans, seen by its largest plane.
+
+    None if that is nearly upright or level, or if the thing has a level plane, too: monitors have slanting screens.
+    """
     if not node.planes:
         return None
-    leaning = max(node.planes, key=lambda plane: plane.area).normal
+    largest = max(node.planes, key=lambda plane: plane.area)
+    leaning = largest.normal
+    level = any(abs(p.normal[2]) > LEVEL and p.area > BESIDE * largest.area for p in node.planes)
+    if level or min(abs(leaning[2]), np.sqrt(1.0 - min(leaning[2] ** 2, 1.0))) < LEANS:
+        return None
     straight = leaning * [1.0, 1.0, 0.0] if abs(leaning[2]) < np.sqrt(0.5) else leaning * [0.0, 0.0, 1.0]
     straight = straight / np.linalg.norm(straight)
     axis = np.cross(straight, leaning)
     angle = float(np.arctan2(np.linalg.norm(axis), straight @ leaning))
-    if angle < 1e-6:
-        return None
     middle = transform(None, node.box.T_map_box[:3, 3])
     return middle @ transform(exp_so3(angle * axis / np.linalg.norm(axis))) @ inverse(middle)
 

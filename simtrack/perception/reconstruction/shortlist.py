@@ -127,7 +127,7 @@ def _fits(
 def could_lie(view: EntityView) -> bool:
     """Whether enough was seen to believe that a thing does not stand as it is made to: sides of it, or faces."""
     flat = sum(plane.area for plane in view.node.planes)
-    return np.count_nonzero(view.open_sides) < _UNSEEN_SIDES or flat > _FLAT * view.area
+    return bool(np.count_nonzero(view.open_sides) < _UNSEEN_SIDES or flat > _FLAT * view.area)
 
 
 def on_its_bottom(node: EntityNode) -> EntityNode:
