@@ -48,6 +48,25 @@ def test_heights_follow_the_models_from_the_floor_upwards() -> None:
     assert snapped.afloat == [] and snapped.stuck == []
 
 
+def test_what_has_no_place_beside_another_is_laid_on_it() -> None:
+    """Models are wider than what was seen: both do not fit on the stool."""
+    graph = corner(
+        stool=("table", block((0.3, 0.3, 0.5), (0.0, 0.0, 0.0))),
+        first=("box", block((0.13, 0.2, 0.05), (-0.07, 0.0, 0.5))),
+        second=("box", block((0.13, 0.2, 0.05), (0.07, 0.0, 0.5))),
+    )
+    wide = slab((0.25, 0.2, 0.05))
+    chosen = {
+        "stool": CadCandidate(slab((0.3, 0.3, 0.5)), at(0.0, 0.0, 0.25), 1.0),
+        "first": CadCandidate(wide, at(-0.06, 0.0, 0.525), 1.0),
+        "second": CadCandidate(wide, at(0.06, 0.0, 0.525), 1.0),
+    }
+    snapped = snap(graph, chosen)
+    assert snapped.stuck == []
+    bottoms = sorted(solid_of(snapped.candidates[name]).bottom for name in ("first", "second"))
+    assert bottoms == pytest.approx([0.5, 0.55], abs=1e-4)
+
+
 def test_what_stands_on_a_model_is_carried_out_of_the_wall_with_it() -> None:
     graph = corner(
         table=("table", table_mesh((1.0, 0.6, 0.7), (0.0, 1.69, 0.0))),
