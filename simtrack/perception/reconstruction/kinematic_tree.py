@@ -5,7 +5,7 @@ kept and scaled with alpha. Supporting edges become fixed joints of what a hand 
 rest. The zero of every joint is where it was seen, so that the scene at rest is the scene that was seen.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -39,6 +39,7 @@ def kinematic_tree(
     chosen: Mapping[str, CadCandidate],
     ground: float | None = None,
     parts: Mapping[str, str] | None = None,
+    resting: Collection[str] = (),
 ) -> BodyTree:
     """The tree of a scene.
 
@@ -48,6 +49,7 @@ def kinematic_tree(
         chosen: entity -> its aligned model, for all entities but layout.
         ground: height in metres of a level ground that nobody saw; none if None.
         parts: entity -> part of its supporter's model that it stands on; the base if it is not told.
+        resting: entities that rest on something, though the support that the graph guesses is far below.
     """
     of_entity = body_names(graph)
     taken = {*of_entity.values(), GROUND}
@@ -73,7 +75,7 @@ def kinematic_tree(
         grounded = ground is not None and graph.supports[entity].kind is SupportKind.ROOT
         if grounded:
             parent = bodies[1].name
-        kind: JointKind = "floating" if is_free(graph, entity, candidate, grounded=grounded) else "fixed"
+        kind: JointKind = "floating" if _floats(graph, entity, candidate, grounded, resting) else "fixed"
         T_map_base = np.asarray(candidate.T_map_model, float)
         parent = links.get((graph.supports[entity].parent, (parts or {}).get(entity, "")), parent)
         joint = BodyJoint(f"{body_name}/{kind}", kind, parent, inverse(poses[parent]) @ T_map_base)
@@ -92,6 +94,13 @@ def body_names(graph: ContactGraph) -> dict[str, str]:
     return {SCENE: ROOT} | {entity: _unique(_printable(entity), taken) for entity in graph.descendants()}
 
 
+def _floats(
+    graph: ContactGraph, entity: str, candidate: CadCandidate, grounded: bool, resting: Collection[str]
+) -> bool:
+    held = is_far_above(graph.nodes[entity], graph.supports[entity]) and entity not in resting
+    return not held and is_free(graph, entity, candidate, grounded=grounded)
+
+
 def is_free(graph: ContactGraph, entity: str, candidate: CadCandidate, *, grounded: bool = False) -> bool:
     """Whether a hand can lift the entity: not hung, not furniture, not heavy, and standing on something.
 
@@ -99,8 +108,6 @@ def is_free(graph: ContactGraph, entity: str, candidate: CadCandidate, *, ground
     """
     support = graph.supports[entity]
     if support.kind is SupportKind.HUNG or (support.kind is SupportKind.ROOT and not grounded):
-        return False
-    if is_far_above(graph.nodes[entity], support):
         return False
     return graph.nodes[entity].semantic_class not in FIXED_CLASSES and scaled_mass(candidate) <= LIFTABLE
 

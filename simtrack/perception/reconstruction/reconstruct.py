@@ -162,13 +162,13 @@ def reconstruct(
     attempt = _settled_attempt(graph, shortlists, selection, ground, config, name)
     selection, snapped, chosen = attempt.selection, attempt.snapped, attempt.chosen
     _selection_notes(selection, notes)
-    _held_notes(graph, notes)
+    _held_notes(graph, snapped, notes)
     _snapping_notes(graph, snapped, notes)
     _shrinking_notes(attempt, shortlists, notes)
     _settling_notes(graph, attempt.settled, notes)
     placed = _settled(graph, snapped.candidates, attempt.settled)
     say("kinematic tree", 0.98)
-    tree = kinematic_tree(name, graph, placed, ground, snapped.parts)
+    tree = kinematic_tree(name, graph, placed, ground, snapped.parts, snapped.resting)
     residuals = eq1_residuals(graph, placed, config.snapping)
     choices = {
         entity: Choice(
@@ -214,7 +214,7 @@ def _settled_attempt(
 
     def attempt(selection: Selection, chosen: Mapping[str, CadCandidate]) -> _Attempt:
         snapped = snap(graph, chosen, config.snapping, ground)
-        tree = kinematic_tree(name, graph, snapped.candidates, ground, snapped.parts)
+        tree = kinematic_tree(name, graph, snapped.candidates, ground, snapped.parts, snapped.resting)
         return _Attempt(selection, chosen, snapped, settle(tree, config.settling))
 
     for _ in range(config.attempts):
@@ -322,9 +322,9 @@ def _own(node: EntityNode, notes: list[Note]) -> Sequence[CadCandidate]:
     return (candidate,)
 
 
-def _held_notes(graph: ContactGraph, notes: list[Note]) -> None:
+def _held_notes(graph: ContactGraph, snapped: Snapped, notes: list[Note]) -> None:
     for name, support in graph.supports.items():
-        if is_far_above(graph.nodes[name], support):
+        if is_far_above(graph.nodes[name], support) and name not in snapped.resting:
             message = (
                 f"what holds it was not seen, and '{support.parent}' is too far below; it is fixed where it was seen"
             )

@@ -74,6 +74,8 @@ class Snapped:
     """Entities below which there is nothing of their supporter."""
     stuck: list[tuple[str, str, float]] = field(default_factory=list)
     """Pairs that are still in each other, and how deep, metres."""
+    resting: frozenset[str] = frozenset()
+    """What is far above a support that is only guessed, but rests on something else."""
 
 
 def snap(
@@ -129,6 +131,7 @@ class _Snapping:
         self.start = _solids(graph, chosen)
         self.shifts = {name: np.zeros(3) for name in self.start}
         self.afloat: set[str] = set()
+        self.resting: set[str] = set()
         self.parts: dict[str, str] = {}
         self.faces: dict[str, tuple[str, PlacedSupport]] = {}
         """What each stands on: a face of its supporter as that was before it moved."""
@@ -156,6 +159,7 @@ class _Snapping:
             self.parts,
             sorted(self.afloat),
             [(c.first, c.second, c.depth) for c in stuck],
+            frozenset(self.resting),
         )
 
     # ---------------------------------------------------------------------------------------------------------- heights
@@ -172,7 +176,9 @@ class _Snapping:
             elif support.kind is SupportKind.ROOT:
                 if self.ground is not None:
                     self.shifts[name][2] += self.ground - self._solid(name).bottom
-            elif not is_far_above(self.graph.nodes[name], support):
+            elif is_far_above(self.graph.nodes[name], support):
+                self._onto_whatever(name)
+            else:
                 self._put_down(name, support.parent, support.height)
             self.rested[name] = self._against(name)
 
@@ -203,6 +209,16 @@ class _Snapping:
         if found is None:
             self.afloat.add(name)
         else:
+            self._shift(name, np.array([0.0, 0.0, found]))
+
+    def _onto_whatever(self, name: str) -> None:
+        """Rest on anything right below, though nobody saw that it stands on that."""
+        below = {
+            other: self._solid(other) for other in self.start if other not in (name, *self.graph.descendants(name))
+        }
+        found = resting_rise(self._solid(name), below, (-self.config.sink, self.config.sink))
+        if found is not None:
+            self.resting.add(name)
             self._shift(name, np.array([0.0, 0.0, found]))
 
     def _rise(self, name: str, solid: Solid, reach: float) -> float | None:
