@@ -24,7 +24,7 @@ class GoalTask(Task):
     """
 
     macros = ("grasp", "place")
-    haste: float = 0.01
+    haste: float = 0.002
     """What a step costs."""
 
     def __init__(self, goals: Sequence[str] = ()) -> None:
