@@ -12,7 +12,7 @@ import numpy as np
 
 from simtrack.contracts import Float64
 from simtrack.envs.actions import Outcome
-from simtrack.envs.arm import ARM, ASIDE, READY, ArmKinematics
+from simtrack.envs.arm import ARM, ASIDE, RAISED, READY, UPWARDS, ArmKinematics
 from simtrack.envs.grasps import suction_spot
 from simtrack.geometry.transforms import apply, inverse, yaw_of
 from simtrack.objects import ObjectModel
@@ -127,7 +127,7 @@ class Manipulator:
             self.outcome = Outcome.OUT_OF_REACH
             return
         yield from self._unfold()
-        yield from self._go(above)
+        yield from self._approach(above)
         touched = False
         for depth in np.arange(HOVER - DOWN, -DEEPER, -DOWN):
             lower = self._solve(target + (0.0, 0.0, float(depth)), self._joints())
@@ -142,6 +142,7 @@ class Manipulator:
             heading = yaw_of(T_map_base) + float(np.arctan2(T_base_cup[1, 1], T_base_cup[0, 1]))
             self.held = Held(model.name, T_map_object.copy(), cup, heading)
         yield from self._lift(target)
+        yield from self._raise()
         self.outcome = Outcome.DONE if touched else Outcome.MISSED
 
     def _place(self, position: Float64, T_map_base: Float64, turns: Sequence[float | None], clearance: float) -> Motion:
@@ -159,7 +160,7 @@ class Manipulator:
             self.outcome = Outcome.OUT_OF_REACH
             return
         height, above, down = best
-        yield from self._go(above)
+        yield from self._approach(above)
         for share in np.linspace(0.0, 1.0, int(np.ceil(height / DOWN)) + 1)[1:]:
             yield from self._go({name: above[name] + share * (down[name] - above[name]) for name in ARM})
         yield from self._wait(2)
@@ -167,7 +168,7 @@ class Manipulator:
         self.held = None
         yield from self._wait(2)
         yield from self._go(above)
-        yield from self._go(READY)
+        yield from self._raise()
         self.outcome = Outcome.DONE
 
     def _cup_for(
@@ -183,8 +184,18 @@ class Manipulator:
         """From the tucked posture beside the robot to the one before its chest."""
         if self._tucked:
             yield from self._go(ASIDE)
+            yield from self._go(RAISED)
             self._tucked = False
-        yield from self._go(READY)
+
+    def _approach(self, joints: Mapping[str, float]) -> Motion:
+        """To joint angles with the cup over a place, and down to it at the end."""
+        yield from self._go({name: RAISED[name] if name in UPWARDS else angle for name, angle in joints.items()})
+        yield from self._go(joints)
+
+    def _raise(self) -> Motion:
+        """Up from where the arm is, and then before the chest: over whatever stands there."""
+        yield from self._go({name: RAISED[name] for name in UPWARDS})
+        yield from self._go(RAISED)
 
     def _lift(self, target: Float64) -> Motion:
         _, joints = self._highest(target, None)
