@@ -74,7 +74,7 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
             raise InvalidValueError("argument", unknown[0], ", ".join(known))
         self.settings = Settings(observation, **arguments)
         self.task = make_task(task)
-        self.task_name = task if isinstance(task, str) else type(task).__name__
+        self.task_name = self.task.script or type(self.task).__name__
         chosen = with_objects(load_scene(scene or self.task.scene), self.settings.objects)
         self.scene = self.task.adapt(fixed_building(chosen))
         self.task.check(self.scene)
