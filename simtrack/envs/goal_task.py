@@ -25,6 +25,7 @@ class GoalTask(Task):
 
     macros = ("grasp", "place")
     script = "tidy"
+    eye, focus = (0.35, 1.25, 1.35), (0.5, 0.0, 0.85)
     haste: float = 0.002
     """What a step costs."""
 
