@@ -18,6 +18,7 @@ def env(
     keypoint_error: float | None = None,
     video: Path | None = None,
     record: Path | None = None,
+    record_as: Literal["mcap", "bop"] = "mcap",
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
     threads: int = 1,
 ) -> int:
@@ -34,13 +35,15 @@ def env(
         miss_rate: Share of visible objects that the detector does not find; the oracle's own if not given.
         keypoint_error: Median error of the detector's keypoints as a share of the object's size.
         video: Write a video of all episodes to this file.
-        record: Write an MCAP log of each episode to this folder.
+        record: Record each episode to this folder.
+        record_as: Logs that simtrack replay reads, or a data set in the format of BOP.
         json_file: Keep the figures of each episode in this file; those that it has already are not played again.
         threads: Threads of the compiled kernels.
     """
     import gymnasium as gym
 
     from simtrack.cli import console
+    from simtrack.envs.bop_recorder import BopRecorder
     from simtrack.envs.episodes import EpisodeFile
     from simtrack.envs.play import play
     from simtrack.envs.wrappers import Recorder, Video
@@ -60,7 +63,7 @@ def env(
     if video is not None:
         made = Video(made, video)
     if record is not None:
-        made = Recorder(made, record)
+        made = Recorder(made, record) if record_as == "mcap" else BopRecorder(made, record)
     seeds = range(seed, seed + episodes)
     with made:
         kept = None

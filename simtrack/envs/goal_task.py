@@ -1,4 +1,4 @@
-"""Tasks that are stated as relations: ``relay in materialbox``. One's own is a scene, goals and, if wanted, a reward."""
+"""Tasks that are stated as relations: ``relay in materialbox``. One's own is a scene, goals, and a reward if wanted."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
