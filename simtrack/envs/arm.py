@@ -19,7 +19,11 @@ READY: Mapping[str, float] = {
     "arm_6_joint": 1.12, "arm_7_joint": 0.0,
 }  # fmt: skip
 """Posture before the chest, above tables, with the cup pointing down: the search for joint angles begins here."""
-ASIDE: Mapping[str, float] = {**READY, "arm_1_joint": -1.57}
+RAISED: Mapping[str, float] = {**READY, "arm_2_joint": -1.08, "arm_4_joint": 1.1, "arm_6_joint": 1.3}
+"""The same 11 cm higher, with the cup tilted by 15 degrees: things are carried over others."""
+UPWARDS = ("arm_2_joint", "arm_4_joint", "arm_6_joint")
+"""Joints that lead from `READY` to `RAISED`."""
+ASIDE: Mapping[str, float] = {**RAISED, "arm_1_joint": -1.57}
 """The same beside the robot: on the way from the tucked posture, over the edge of a table."""
 
 

@@ -6,13 +6,13 @@ it truly touches, or nothing. No pose is ever set.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from simtrack.contracts import Float64
-from simtrack.envs.arm import ARM, ASIDE, READY, ArmKinematics
+from simtrack.envs.actions import Outcome
+from simtrack.envs.arm import ARM, ASIDE, RAISED, READY, UPWARDS, ArmKinematics
 from simtrack.envs.grasps import suction_spot
 from simtrack.geometry.transforms import apply, inverse, yaw_of
 from simtrack.objects import ObjectModel
@@ -41,25 +41,12 @@ PATIENCE = 60
 """Control steps that a joint may take to its target."""
 
 
-class Outcome(StrEnum):
-    """How a macro fared."""
-
-    IDLE = "idle"
-    BUSY = "busy"
-    DONE = "done"
-    NO_SPOT = "no-spot"
-    """The object has no flat spot on top."""
-    OUT_OF_REACH = "out-of-reach"
-    MISSED = "missed"
-    """The cup came down where the object is believed to be, and touched nothing."""
-    EMPTY = "empty"
-    """There is nothing in the cup to be placed."""
-
-
 @dataclass(frozen=True, slots=True)
 class Held:
     """What the robot believes to hold."""
 
+    class_name: str
+    """Name of its model."""
     T_map_object: Float64
     """(4, 4), where it was believed to be when it was grasped."""
     cup: Float64
@@ -115,6 +102,10 @@ class Manipulator:
         """
         self._begin(self._place(np.asarray(position, dtype=float), T_map_base, turns or (None,), clearance))
 
+    def refuse(self, outcome: Outcome) -> None:
+        """Do not even begin, for this reason."""
+        self._motion, self.outcome = iter(()), outcome
+
     def step(self) -> None:
         """Go on with the macro, if one runs: once before each control step."""
         if self.busy:
@@ -136,7 +127,7 @@ class Manipulator:
             self.outcome = Outcome.OUT_OF_REACH
             return
         yield from self._unfold()
-        yield from self._go(above)
+        yield from self._approach(above)
         touched = False
         for depth in np.arange(HOVER - DOWN, -DEEPER, -DOWN):
             lower = self._solve(target + (0.0, 0.0, float(depth)), self._joints())
@@ -149,8 +140,9 @@ class Manipulator:
             T_base_cup = self._arm.cup(self._joints() | {TORSO: self._torso()})
             cup = apply(T_map_base, T_base_cup[:3, 3][None])[0]
             heading = yaw_of(T_map_base) + float(np.arctan2(T_base_cup[1, 1], T_base_cup[0, 1]))
-            self.held = Held(T_map_object.copy(), cup, heading)
+            self.held = Held(model.name, T_map_object.copy(), cup, heading)
         yield from self._lift(target)
+        yield from self._raise()
         self.outcome = Outcome.DONE if touched else Outcome.MISSED
 
     def _place(self, position: Float64, T_map_base: Float64, turns: Sequence[float | None], clearance: float) -> Motion:
@@ -168,7 +160,7 @@ class Manipulator:
             self.outcome = Outcome.OUT_OF_REACH
             return
         height, above, down = best
-        yield from self._go(above)
+        yield from self._approach(above)
         for share in np.linspace(0.0, 1.0, int(np.ceil(height / DOWN)) + 1)[1:]:
             yield from self._go({name: above[name] + share * (down[name] - above[name]) for name in ARM})
         yield from self._wait(2)
@@ -176,7 +168,7 @@ class Manipulator:
         self.held = None
         yield from self._wait(2)
         yield from self._go(above)
-        yield from self._go(READY)
+        yield from self._raise()
         self.outcome = Outcome.DONE
 
     def _cup_for(
@@ -192,8 +184,18 @@ class Manipulator:
         """From the tucked posture beside the robot to the one before its chest."""
         if self._tucked:
             yield from self._go(ASIDE)
+            yield from self._go(RAISED)
             self._tucked = False
-        yield from self._go(READY)
+
+    def _approach(self, joints: Mapping[str, float]) -> Motion:
+        """To joint angles with the cup over a place, and down to it at the end."""
+        yield from self._go({name: RAISED[name] if name in UPWARDS else angle for name, angle in joints.items()})
+        yield from self._go(joints)
+
+    def _raise(self) -> Motion:
+        """Up from where the arm is, and then before the chest: over whatever stands there."""
+        yield from self._go({name: RAISED[name] for name in UPWARDS})
+        yield from self._go(RAISED)
 
     def _lift(self, target: Float64) -> Motion:
         _, joints = self._highest(target, None)
