@@ -67,7 +67,8 @@ class HandDirector:
                     self._area(action.to)
                 except SimtrackError as error:
                     raise FileFormatError(world.scene.path, f"hand.script.{k}.to", str(error)) from error
-        self._mocap = [int(self._model.body(name).mocapid[0]) for name in hand.PARTS]
+        mocap = [int(self._model.body(name).mocapid[0]) for name in hand.PARTS]
+        self._mocap = slice(mocap[0], mocap[-1] + 1)  # one after the other: they are made together
         self._contacts = [g for g in range(self._model.ngeom) if self._model.geom(g).name.startswith("hand/contact")]
         self._faces = [
             Area(part.T_map_part @ T, (0.0, 0.0), (0.0, 0.0), np.asarray(size, dtype=float))

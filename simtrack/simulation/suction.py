@@ -20,8 +20,6 @@ RIM = 0.006
 """Radius of the cup, metres."""
 SEAL = 0.008
 """Metres before the rim within which a surface closes the cup: it is soft."""
-AWAKE = -11
-"""MuJoCo's mark of a tree that stays awake for the next ten steps at least (-1 - mjMINAWAKE)."""
 LEAK = 0.008
 """Largest difference between the distances at the rim, metres: a steeper surface leaves a gap."""
 
@@ -46,6 +44,8 @@ class SuctionCup:
 
     def reset(self) -> None:
         """Forget what was held: the world has begun anew."""
+        if self.holding is not None:
+            self._may_sleep(self.holding, True)
         self.holding = None
 
     @property
@@ -82,6 +82,7 @@ class SuctionCup:
         world.model.eq_data[weld, 3:6] = T[:3, 3]
         world.model.eq_data[weld, 6:10] = quaternion_from_rotation(T[:3, :3])
         data.eq_active[weld] = 1
+        self._may_sleep(name, False)
         self.holding = name
         return name
 
@@ -90,6 +91,13 @@ class SuctionCup:
         if self.holding is not None:
             world = self._simulation.world
             world.data.eq_active[world.model.equality(f"suction/{self.holding}").id] = 0
-            # What was held still has fallen asleep, and a constraint that ends wakes nothing.
-            world.data.tree_asleep[world.model.body_treeid[world.bodies[self.holding]]] = AWAKE
+            self._may_sleep(self.holding, True)
             self.holding = None
+
+    def _may_sleep(self, name: str, may: bool) -> None:
+        """Leave a thing out of the physics while it rests, or not: what is held still would not fall when let go."""
+        import mujoco
+
+        world, policy = self._simulation.world, mujoco.mjtSleepPolicy
+        tree = world.model.body_treeid[world.bodies[name]]
+        world.model.tree_sleep_policy[tree] = policy.mjSLEEP_AUTO_ALLOWED if may else policy.mjSLEEP_NEVER
