@@ -1,11 +1,14 @@
 """The world, the robot's sensors and what is made of them, one control step at a time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from simtrack.contracts import Belief, Command, DetectionResult, JointState, Odometry, RgbdFrame, SensorFrame
+from simtrack.envs.actions import Request
+from simtrack.envs.macros import Manipulator
 from simtrack.envs.observations import Proprioception
+from simtrack.envs.requests import begin
 from simtrack.envs.resolution import noise_in_small_images, stack_config
 from simtrack.envs.settings import CONTROL_NS, Settings, pixel_scale
 from simtrack.envs.truth import IdealPerception, true_belief
@@ -40,6 +43,8 @@ class Snapshot:
     """The camera's image, where there is one."""
     feed: tuple[SensorFrame | DetectionResult, ...] = ()
     """What arrived since the last step: sensor frames, and the detector's answers after the images they belong to."""
+    holding: str | None = None
+    """Name of the object that the gripper truly holds."""
 
 
 class Loop:
@@ -58,6 +63,8 @@ class Loop:
             sensors=settings.sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
             scan_key=SCAN_KEY, servo=KEY_NS,
         )  # fmt: skip
+        self.manipulator = Manipulator(self.simulation) if scene.robot.suction else None
+        """Arm and cup, where there is one."""
         self._ideal = IdealPerception(self.simulation, camera)
         self._stack: PerceptionStack | None = None
         self._felt = Proprioception(JointState(0, (), np.zeros(0)), 0.0, 0.0)
@@ -75,6 +82,8 @@ class Loop:
         simulation = self.simulation
         simulation.restart(seed)
         self._ideal.reset()
+        if self.manipulator is not None:
+            self.manipulator.reset()
         self._belief = self._image = None
         if self.has_stack:
             old, self._stack = self._stack, self._make_stack(seed)
@@ -96,18 +105,27 @@ class Loop:
             config=stack_config(pixel_scale(simulation.camera)),
         )
 
-    def step(self, command: Command) -> Snapshot:
-        """Run for one control step under a command."""
+    @property
+    def busy(self) -> bool:
+        """Whether the arm is at work."""
+        return self.manipulator is not None and self.manipulator.busy
+
+    def step(self, command: Command, request: Request | None = None) -> Snapshot:
+        """Run for one control step under a command; what the arm is asked for begins if it is not at work."""
         simulation, colours = self.simulation, "rgbd" in self._settings.modes
+        if self.manipulator is not None:
+            if request is not None and not self.manipulator.busy and self._belief is not None:
+                begin(self.manipulator, request, self._belief, simulation.models)
+            self.manipulator.step()
         if self._stack is not None:
             colours = colours or self._stack.wants_image(simulation.now + CONTROL_NS)
         self._feed.clear()
         for frame in simulation.advance(command, want_rgb=colours):
             self._feed.append(frame)
             if isinstance(frame, JointState):
-                self._felt = Proprioception(frame, self._felt.linear, self._felt.angular)
+                self._felt = replace(self._felt, joints=frame)
             elif isinstance(frame, Odometry):
-                self._felt = Proprioception(self._felt.joints, frame.linear, frame.angular)
+                self._felt = replace(self._felt, linear=frame.linear, angular=frame.angular)
             elif isinstance(frame, RgbdFrame):
                 self._image = frame
             if self._stack is not None:
@@ -121,9 +139,13 @@ class Loop:
             visible = self._ideal.visible(truth)
             state = true_belief(truth, visible) if "state" in self._settings.modes else None
             belief = self._ideal.process(truth, visible) if self._stack is None else None
-        belief = belief or self._belief
+        belief = self._belief = belief or self._belief
         assert belief is not None
-        return Snapshot(truth, belief, state, self._felt, self._image, tuple(self._feed))
+        felt, holding = self._felt, None
+        if self.manipulator is not None:
+            held, holding = self.manipulator.held, self.manipulator.cup.holding
+            felt = replace(felt, macro=self.manipulator.outcome, holding=held.class_name if held is not None else None)
+        return Snapshot(truth, belief, state, felt, self._image, tuple(self._feed), holding)
 
     def _end_stack(self) -> None:
         if self._stack is not None:

@@ -6,12 +6,12 @@ it truly touches, or nothing. No pose is ever set.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from simtrack.contracts import Float64
+from simtrack.envs.actions import Outcome
 from simtrack.envs.arm import ARM, ASIDE, READY, ArmKinematics
 from simtrack.envs.grasps import suction_spot
 from simtrack.geometry.transforms import apply, inverse, yaw_of
@@ -41,25 +41,12 @@ PATIENCE = 60
 """Control steps that a joint may take to its target."""
 
 
-class Outcome(StrEnum):
-    """How a macro fared."""
-
-    IDLE = "idle"
-    BUSY = "busy"
-    DONE = "done"
-    NO_SPOT = "no-spot"
-    """The object has no flat spot on top."""
-    OUT_OF_REACH = "out-of-reach"
-    MISSED = "missed"
-    """The cup came down where the object is believed to be, and touched nothing."""
-    EMPTY = "empty"
-    """There is nothing in the cup to be placed."""
-
-
 @dataclass(frozen=True, slots=True)
 class Held:
     """What the robot believes to hold."""
 
+    class_name: str
+    """Name of its model."""
     T_map_object: Float64
     """(4, 4), where it was believed to be when it was grasped."""
     cup: Float64
@@ -115,6 +102,10 @@ class Manipulator:
         """
         self._begin(self._place(np.asarray(position, dtype=float), T_map_base, turns or (None,), clearance))
 
+    def refuse(self, outcome: Outcome) -> None:
+        """Do not even begin, for this reason."""
+        self._motion, self.outcome = iter(()), outcome
+
     def step(self) -> None:
         """Go on with the macro, if one runs: once before each control step."""
         if self.busy:
@@ -149,7 +140,7 @@ class Manipulator:
             T_base_cup = self._arm.cup(self._joints() | {TORSO: self._torso()})
             cup = apply(T_map_base, T_base_cup[:3, 3][None])[0]
             heading = yaw_of(T_map_base) + float(np.arctan2(T_base_cup[1, 1], T_base_cup[0, 1]))
-            self.held = Held(T_map_object.copy(), cup, heading)
+            self.held = Held(model.name, T_map_object.copy(), cup, heading)
         yield from self._lift(target)
         self.outcome = Outcome.DONE if touched else Outcome.MISSED
 

@@ -24,6 +24,7 @@ from simtrack.contracts import (
     Track,
     TrackStatus,
 )
+from simtrack.envs.actions import Outcome
 from simtrack.evaluation.record import graph_name
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import (
@@ -54,6 +55,7 @@ REGIONS = 12
 STATUSES = tuple(TrackStatus)
 ANSWERS = (Status.OK, Status.AMBIGUOUS, Status.LOST)
 """Statuses of the localization that are told apart; any other counts as a predicted pose."""
+OUTCOMES = tuple(Outcome)
 JOINTS = (HEAD_PAN, HEAD_TILT, TORSO)
 
 
@@ -77,6 +79,8 @@ class Layout:
     """Of the robot's camera."""
     depth_range: float
     """Metres: the largest depth that the camera reads."""
+    macros: tuple[str, ...] = ()
+    """What the arm can be asked for."""
 
     def space(self, mode: str) -> spaces.Dict:
         """The space of one mode; finite bounds, metres, radians, row 0 on top."""
@@ -110,11 +114,15 @@ class Layout:
         return spaces.Dict({**entries, **self._robot()})
 
     def _robot(self) -> dict[str, spaces.Space]:
-        return {
+        entries: dict[str, spaces.Space] = {
             "joints": _box((3,), -np.pi, np.pi),
             "speed": _box((2,), -SPEED, SPEED),
             "time": _box((1,), 0.0, self.seconds + 1.0),
         }
+        if self.macros:
+            entries["macro"] = _box((len(OUTCOMES),), 0, 1, np.int8)
+            entries["holding"] = _box((len(self.classes),), 0, 1, np.int8)
+        return entries
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +135,10 @@ class Proprioception:
     """m/s, by the wheels."""
     angular: float
     """rad/s, by the wheels."""
+    macro: Outcome = Outcome.IDLE
+    """Of the arm."""
+    holding: str | None = None
+    """Class of what the cup is believed to hold, as long as its vacuum holds."""
 
 
 class Encoder:
@@ -166,7 +178,7 @@ class Encoder:
         out["base_deviation"][:] = np.minimum(deviation, np.sqrt(VARIANCE))
         answer = ANSWERS.index(where.status) if where.status in ANSWERS else len(ANSWERS)
         out["localization"][answer] = 1
-        out.update(encode_robot(felt, belief.stamp))
+        out.update(encode_robot(felt, belief.stamp, self.layout))
         return out
 
     def _assign(self, tracks: Sequence[Track]) -> list[tuple[int, Track]]:
@@ -219,16 +231,20 @@ class Encoder:
         return last != seen.stamp
 
 
-def encode_robot(felt: Proprioception, stamp: int) -> Arrays:
+def encode_robot(felt: Proprioception, stamp: int, layout: Layout) -> Arrays:
     """Arrays of what the robot feels of itself."""
     positions = dict(zip(felt.joints.names, felt.joints.positions.tolist(), strict=True))
     joints = np.array([positions.get(name, 0.0) for name in JOINTS], np.float32)
     speed = np.clip(np.array([felt.linear, felt.angular], np.float32), -SPEED, SPEED)
-    return {
+    out: Arrays = {
         "joints": np.clip(joints, -np.float32(np.pi), np.float32(np.pi)),
         "speed": speed,
         "time": np.array([stamp / NANOSECONDS], np.float32),
     }
+    if layout.macros:
+        out["macro"] = np.array([felt.macro is outcome for outcome in OUTCOMES], np.int8)
+        out["holding"] = np.array([felt.holding == name for name in layout.classes], np.int8)
+    return out
 
 
 def encode_image(frame: RgbdFrame, layout: Layout) -> Arrays:

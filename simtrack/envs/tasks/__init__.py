@@ -10,6 +10,7 @@ from simtrack.errors import InvalidValueError, UnknownNameError
 TASKS = {
     "active-perception": "simtrack.envs.tasks.active_perception:ActivePerception",
     "localize": "simtrack.envs.tasks.localize:Localize",
+    "tidy": "simtrack.envs.tasks.tidy:Tidy",
 }
 """Name -> where its class is."""
 
