@@ -37,6 +37,8 @@ LEAST_SUPPORT = 0.01
 """Square metres of a face that things stand on."""
 VIEW = 1.3
 """Metres between the robot and what it looks at first."""
+SURVEYED = 0.6
+"""Metres: free bodies that are larger, and those with doors, are furniture, and surveyed where they stand."""
 TRIES = 2000
 
 
@@ -162,7 +164,8 @@ class _Reading:
         bearers = {int(self.model.body_rootid[mover]) for mover in movers.values() if mover}
         parts, moving = [], []
         for body, mesh in self.surfaces.items():
-            if self.is_free(body) and int(self.model.body_rootid[body]) not in bearers:
+            bears = int(self.model.body_rootid[body]) in bearers
+            if self.is_free(body) and not bears and mesh.extents.max() < SURVEYED:
                 continue
             if not movers[body]:
                 parts.append(self._part(body, mesh, lowered, supports=supports))
