@@ -5,21 +5,19 @@ follow a straight line where the arm alone does not reach, and the cup holds wha
 is ever set.
 """
 
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import numpy as np
 
 from simtrack.contracts import Articulation, Float64
 from simtrack.envs.actions import Outcome
-from simtrack.envs.fronts import SEALING, COMFORT, Front, FrontReach, flat_spots, followed, heading, turned
+from simtrack.envs.fronts import BEFORE, COMFORT, Front, FrontReach, flat_spots, followed, turned
 from simtrack.envs.macros import Held, Manipulator, Motion
 from simtrack.envs.settings import CONTROL_HZ
 from simtrack.geometry.transforms import apply, inverse, yaw_of
 from simtrack.objects import ObjectModel
 from simtrack.objects.tiago import TORSO
 
-BEFORE = 0.12
-"""Metres before a face from which the cup approaches it."""
 STEP, DEEPER = 0.008, 0.03
 """Metres that it comes nearer at a time, and beyond the believed face at which it gives up."""
 SPEED = 0.10
@@ -46,16 +44,11 @@ def articulate(m: Manipulator, articulation: Articulation, position: float, goal
         return m.refuse(Outcome.NO_SPOT)
     start = m.T_map_base
     place, inwards = _in_base(m, *front.at(spot, position))
-    aimed = reach.aim(place, inwards, m.torso(), SEALING)
-    if aimed is None or reach.follows(front, spot, (position, goal), start, m.torso()) is None:
+    begun = reach.approach(place, inwards, m.torso())
+    if begun is None or reach.follows(front, spot, (position, goal), start, m.torso()) is None:
         return m.refuse(Outcome.OUT_OF_REACH)
-    joints, lean = aimed
-    direction = turned(inwards, lean)
-    above = reach.joints(place - BEFORE * direction, direction, m.torso(), joints) or reach.joints(
-        place - BEFORE * direction, direction, m.torso()
-    )
-    if above is None:
-        return m.refuse(Outcome.OUT_OF_REACH)
+    above, _, direction = begun
+    lean = float(np.arctan2(*np.cross(inwards, direction)[[2]], inwards @ direction))
     yield from m.unfold()
     yield from m.go(above)
     if not (yield from _touch(m, reach, place, direction)):
@@ -149,7 +142,7 @@ def insert(m: Manipulator, place: Float64) -> Motion:
 
 def _touch(
     m: Manipulator, reach: FrontReach, place: Float64, direction: Float64, *, level: bool = False
-) -> "Iterator[None]":
+) -> Generator[None, None, bool]:
     """Approach a face until the cup has hold of something; returns whether it has."""
     for gap in np.arange(BEFORE - STEP, -DEEPER, -STEP).tolist():
         joints = reach.joints(place - gap * direction, direction, m.torso(), m.joints(), level)
@@ -157,8 +150,8 @@ def _touch(
             continue
         yield from m.go(joints)
         if m.cup.close() is not None:
-            return True  # type: ignore[return-value]
-    return False  # type: ignore[return-value]
+            return True
+    return False
 
 
 def _stroke(m: Manipulator, reach: FrontReach, begin: Float64, end: Float64, direction: Float64) -> Motion:

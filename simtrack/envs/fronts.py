@@ -22,11 +22,16 @@ SPACING = 0.02
 """Metres between the places on a face that are tried."""
 SEALING, LEANING = np.deg2rad(25.0), np.deg2rad(58.0)
 """Radians off a face's normal at which the cup finds hold, and up to which it may lean then."""
-LEANS = np.deg2rad([0, 10, -10, 20, -20, 25, -25, 30, -30, 40, -40, 50, -50, 58, -58])
+LEANS = np.deg2rad([0, 12, -12, 25, -25, 40, -40, 58, -58])
 FROM_EDGE = 0.1
 """Metres from the outermost point at which a door is best moved: beside its handle."""
 COMFORT = 0.65
 """Metres above the floor, with the torso down, at which the arm reaches farthest."""
+HAND, UPPER_ARM, FOREARM, SHOULDER_HEIGHT = 0.245, 0.345, 0.24, 0.66
+"""Metres: from wrist to rim, the arm's two long parts with what leads to them, the arm's first axis with the torso down;
+what is farther away than that need not be tried."""
+BEFORE = 0.12
+"""Metres before a face from which the cup approaches it."""
 WAYPOINTS = 7
 """Positions of a joint at which reach is checked."""
 
@@ -115,7 +120,7 @@ class FrontReach:
         start: Mapping[str, float] | None = None,
         level: bool = False,
     ) -> tuple[dict[str, float], float] | None:
-        """Joint angles that bring the cup to a face: the less it leans, and the less the arm moves, the better.
+        """Joint angles that bring the cup to a face, the more the cup looks ahead the better.
 
         Args:
             place: (3,), base frame, metres.
@@ -128,10 +133,25 @@ class FrontReach:
         Returns:
             Joint angles, and how far the cup leans to the left, radians; None if it cannot be reached.
         """
-        for offset in LEANS[np.abs(LEANS) <= lean + 1e-6].tolist():
+        offsets = LEANS[np.abs(LEANS) <= lean + 1e-6].tolist()
+        bearing = float(np.arctan2(inwards[1], inwards[0]))
+        for offset in sorted(offsets, key=lambda angle: abs(bearing + angle)):
             joints = self.joints(place, turned(inwards, offset), torso, start, level)
             if joints is not None:
                 return joints, offset
+        return None
+
+    def approach(
+        self, place: Float64, inwards: Float64, torso: float
+    ) -> tuple[dict[str, float], dict[str, float], Float64] | None:
+        """How the cup gets hold of a face: joint angles before it and at it, and its direction (3,); see `aim`."""
+        bearing = float(np.arctan2(inwards[1], inwards[0]))
+        for offset in sorted(LEANS[np.abs(LEANS) <= SEALING + 1e-6].tolist(), key=lambda angle: abs(bearing + angle)):
+            direction = turned(inwards, offset)
+            joints = self.joints(place, direction, torso)
+            before = None if joints is None else self.joints(place - BEFORE * direction, direction, torso, joints)
+            if joints is not None and before is not None:
+                return before, joints, direction
         return None
 
     def joints(
@@ -143,7 +163,8 @@ class FrontReach:
         level: bool = False,
     ) -> dict[str, float] | None:
         """Joint angles that bring the cup to a place (3,), pointing in a direction, base frame; None: out of reach."""
-        if direction[0] < 0.2 or not 0.25 < np.hypot(place[0] - SHOULDER, place[1]) < 0.85:
+        wrist = place - HAND * direction - (SHOULDER, 0.0, SHOULDER_HEIGHT + torso)
+        if direction[0] < 0.2 or not 0.2 < float(np.linalg.norm(wrist)) < UPPER_ARM + FOREARM:
             return None
         for posture in [start] if start is not None else postures(place):
             found = self.arm.solve(place, torso, posture, direction=direction, level=level)
@@ -167,13 +188,17 @@ class FrontReach:
             How far the cup has to lean at most, radians; None if it cannot be done.
         """
         joints, worst = None, 0.0
-        for number, q in enumerate(np.linspace(*positions, WAYPOINTS).tolist()):
+        for q in np.linspace(*positions, WAYPOINTS).tolist():
             T_base_map = inverse(followed(front, spot, positions[0], q, T_map_base))
             place, inwards = front.at(spot, q)
-            lean = SEALING if number == 0 else LEANING
-            found = self.aim(apply(T_base_map, place[None])[0], T_base_map[:3, :3] @ inwards, torso, lean, joints)
-            if found is None and joints is not None:
-                found = self.aim(apply(T_base_map, place[None])[0], T_base_map[:3, :3] @ inwards, torso, lean)
+            place, inwards = apply(T_base_map, place[None])[0], T_base_map[:3, :3] @ inwards
+            if joints is None:
+                begun = self.approach(place, inwards, torso)
+                if begun is None:
+                    return None
+                joints = begun[1]
+                continue
+            found = self.aim(place, inwards, torso, LEANING, joints)
             if found is None:
                 return None
             joints, worst = found[0], max(worst, abs(found[1]))

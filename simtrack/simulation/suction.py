@@ -22,6 +22,8 @@ SEAL = 0.008
 """Metres before the rim within which a surface closes the cup: it is soft."""
 AWAKE = -11
 """MuJoCo's mark of a tree that stays awake for the next ten steps at least (-1 - mjMINAWAKE)."""
+NUDGE = 1e-9
+"""Newtons on a door or drawer that is held: nothing that a force acts on falls asleep."""
 LEAK = 0.008
 """Largest difference between the distances at the rim, metres: a steeper surface leaves a gap."""
 SWIVEL = np.deg2rad(65.0)
@@ -94,7 +96,8 @@ class SuctionCup:
             world.model.eq_data[tie, 3:6] = T[:3, 3]
             world.model.eq_data[tie, 6:10] = quaternion_from_rotation(T[:3, :3])
         data.eq_active[tie] = 1
-        self._wake(name)
+        if name in self._moving:
+            data.xfrc_applied[self._moving[name], 2] = NUDGE
         self.holding = name
         return name
 
@@ -113,13 +116,11 @@ class SuctionCup:
         if self.holding is not None:
             world = self._simulation.world
             world.data.eq_active[world.model.equality(f"suction/{self.holding}").id] = 0
-            self._wake(self.holding)
+            if self.holding in self._moving:
+                world.data.xfrc_applied[self._moving[self.holding], 2] = 0.0
+            else:  # what was held still has fallen asleep, and a constraint that ends wakes nothing
+                world.data.tree_asleep[world.model.body_treeid[world.bodies[self.holding]]] = AWAKE
             self.holding = None
 
     def _held_body(self, name: str) -> int:
         return self._moving[name] if name in self._moving else self._simulation.world.bodies[name]
-
-    def _wake(self, name: str) -> None:
-        """What is held still falls asleep, and a constraint that begins or ends wakes nothing."""
-        world = self._simulation.world
-        world.data.tree_asleep[world.model.body_treeid[self._held_body(name)]] = AWAKE
