@@ -1,6 +1,5 @@
 """``simtrack env``: let a policy play an environment."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -36,12 +35,13 @@ def env(
         keypoint_error: Median error of the detector's keypoints as a share of the object's size.
         video: Write a video of all episodes to this file.
         record: Write an MCAP log of each episode to this folder.
-        json_file: Write the figures of each episode to this file.
+        json_file: Keep the figures of each episode in this file; those that it has already are not played again.
         threads: Threads of the compiled kernels.
     """
     import gymnasium as gym
 
     from simtrack.cli import console
+    from simtrack.envs.episodes import EpisodeFile
     from simtrack.envs.play import play
     from simtrack.envs.wrappers import Recorder, Video
     from simtrack.errors import InvalidValueError
@@ -61,24 +61,28 @@ def env(
         made = Video(made, video)
     if record is not None:
         made = Recorder(made, record)
+    seeds = range(seed, seed + episodes)
     with made:
-        results = []
-        for result in play(made, policy, range(seed, seed + episodes), feed):
+        kept = None
+        if json_file is not None:
+            kept = EpisodeFile(json_file, {"env": full_id(env_id), "policy": policy, "feed": feed, **arguments})
+        done = kept.results if kept is not None else {}
+        results = [done[number] for number in seeds if number in done]
+        for result in play(made, policy, [number for number in seeds if number not in done], feed):
             print(
                 f"seed {result.seed}: return {result.total:.2f}, {'success' if result.success else 'no success'}, "
                 + ", ".join(f"{name} {value:.3g}" for name, value in result.metrics.items()),
                 flush=True,
             )
             results.append(result)
+            if kept is not None:
+                kept.add(result)
     names = list(results[0].metrics)
     mean = {name: sum(r.metrics[name] for r in results) / episodes for name in names}
     rows = [("success", f"{sum(r.success for r in results)}/{episodes}")]
     rows += [("return", f"{sum(r.total for r in results) / episodes:.3f}")]
     rows += [(name, f"{value:.4g}") for name, value in mean.items()]
     console.show_table(("mean over episodes", "value"), rows, right=(1,))
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps([result.plain() for result in results], indent=1) + "\n")
     return 0
 
 

@@ -86,6 +86,7 @@ class Request:
     def action(self, macros: Sequence[str]) -> Float32:
         """(A,) the action that asks for it, of a task with these macros; what is out of range is cut off."""
         values = dict(zip(WHERE, (*self.position.tolist(), self.heading), strict=True))
+        values["heading"] = float(np.arctan2(np.sin(self.heading), np.cos(self.heading)))
         scaled = {name: 2.0 * (values[name] - low) / (high - low) - 1.0 for name, (low, high) in WHERE.items()}
         return np.clip(vector({self.macro: 1.0, **scaled}, macros), -1.0, 1.0)
 

@@ -13,6 +13,7 @@ from simtrack.envs.policies import Briefing
 from simtrack.envs.settings import (
     CONTROL_HZ,
     Settings,
+    articulations_of,
     classes_of,
     fixed_building,
     furniture_of,
@@ -74,7 +75,7 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
             raise InvalidValueError("argument", unknown[0], ", ".join(known))
         self.settings = Settings(observation, **arguments)
         self.task = make_task(task)
-        self.task_name = task if isinstance(task, str) else type(task).__name__
+        self.task_name = self.task.script or type(self.task).__name__
         chosen = with_objects(load_scene(scene or self.task.scene), self.settings.objects)
         self.scene = self.task.adapt(fixed_building(chosen))
         self.task.check(self.scene)
@@ -85,7 +86,7 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         seconds = self.settings.seconds or self.task.seconds
         self.layout = Layout(
             classes_of(self.scene), self.settings.slots, furniture_of(self.scene), seconds, camera.intrinsics,
-            camera.max_range, self.task.macros,
+            camera.max_range, self.task.macros, articulations_of(self.scene),
         )  # fmt: skip
         spaces = {mode: self.layout.space(mode) for mode in self.settings.modes}
         self.observation_space = (

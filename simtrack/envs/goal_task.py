@@ -24,6 +24,7 @@ class GoalTask(Task):
     """
 
     macros = ("grasp", "place")
+    script = "tidy"
     haste: float = 0.002
     """What a step costs."""
 

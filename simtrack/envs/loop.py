@@ -10,7 +10,7 @@ from simtrack.envs.macros import Manipulator
 from simtrack.envs.observations import Proprioception
 from simtrack.envs.requests import begin
 from simtrack.envs.resolution import noise_in_small_images, stack_config
-from simtrack.envs.settings import CONTROL_NS, Settings, pixel_scale
+from simtrack.envs.settings import Settings, pixel_scale
 from simtrack.envs.truth import IdealPerception, true_belief
 from simtrack.perception.localization import MeshLocalizer
 from simtrack.perception.pipeline import PerceptionStack
@@ -23,8 +23,10 @@ from simtrack.simulation.simulation import Simulation
 
 BUILDING_SEED = 0
 """Decides what belongs to the building and not to an episode: the survey, and how the tracker's models are off."""
-SCAN_KEY = 20_000_000
-"""Nanoseconds between the moments of a lidar's turn: at 2 m/s^2 a straight line between them errs by 0.1 mm."""
+KEY = 20_000_000
+"""Nanoseconds between the states that are remembered: all sensors look at multiples of it."""
+SCAN_KEY = 50_000_000
+"""Nanoseconds between the moments of a lidar's turn: at 1 m/s^2 a straight line between them errs by 0.3 mm."""
 MEMORY = 2_000_000_000
 """Nanoseconds of the past that are kept."""
 
@@ -61,10 +63,12 @@ class Loop:
         self.simulation = Simulation(
             scene, BUILDING_SEED, settings.renderer, camera, settings.lidar,
             sensors=settings.sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
-            scan_key=SCAN_KEY, servo=KEY_NS,
+            scan_key=SCAN_KEY, servo=KEY_NS, key=KEY,
         )  # fmt: skip
         self.manipulator = Manipulator(self.simulation) if scene.robot.suction else None
         """Arm and cup, where there is one."""
+        self.colours = "rgbd" in settings.modes
+        """Whether images have colour; the oracle does not look at it."""
         self._ideal = IdealPerception(self.simulation, camera)
         self._stack: PerceptionStack | None = None
         self._felt = Proprioception(JointState(0, (), np.zeros(0)), 0.0, 0.0)
@@ -112,17 +116,22 @@ class Loop:
 
     def step(self, command: Command, request: Request | None = None) -> Snapshot:
         """Run for one control step under a command; what the arm is asked for begins if it is not at work."""
-        simulation, colours = self.simulation, "rgbd" in self._settings.modes
+        simulation = self.simulation
         if self.manipulator is not None:
             if request is not None and not self.manipulator.busy and self._belief is not None:
+<<<<<<< HEAD
                 begin(self.manipulator, request, self._belief, simulation.models, simulation.static_map)
             self.manipulator.step(None if self._belief is None else self._belief.localization.T_map_base)
             if self.manipulator.busy:
                 command = replace(command, linear=self.manipulator.drive, angular=0.0)
         if self._stack is not None:
             colours = colours or self._stack.wants_image(simulation.now + CONTROL_NS)
+=======
+                begin(self.manipulator, request, self._belief, simulation.models)
+            self.manipulator.step()
+>>>>>>> envs-tidy
         self._feed.clear()
-        for frame in simulation.advance(command, want_rgb=colours):
+        for frame in simulation.advance(command, want_rgb=self.colours):
             self._feed.append(frame)
             if isinstance(frame, JointState):
                 self._felt = replace(self._felt, joints=frame)

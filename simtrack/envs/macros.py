@@ -12,7 +12,7 @@ import numpy as np
 
 from simtrack.contracts import Float64
 from simtrack.envs.actions import Outcome
-from simtrack.envs.arm import ARM, ASIDE, READY, ArmKinematics
+from simtrack.envs.arm import ARM, ASIDE, RAISED, READY, UPWARDS, ArmKinematics
 from simtrack.envs.grasps import suction_spot
 from simtrack.geometry.transforms import apply, inverse, yaw_of
 from simtrack.objects import ObjectModel
@@ -136,8 +136,13 @@ class Manipulator:
         if above is None or self._solve(target, above) is None:
             self.outcome = Outcome.OUT_OF_REACH
             return
+<<<<<<< HEAD
         yield from self.unfold()
         yield from self.go(above)
+=======
+        yield from self._unfold()
+        yield from self._approach(above)
+>>>>>>> envs-tidy
         touched = False
         for depth in np.arange(HOVER - DOWN, -DEEPER, -DOWN):
             lower = self._solve(target + (0.0, 0.0, float(depth)), self.joints())
@@ -153,6 +158,7 @@ class Manipulator:
             T_cup_object = inverse(T_map_base @ T_base_cup) @ T_map_object
             self.held = Held(model.name, T_map_object.copy(), cup, heading, T_cup_object)
         yield from self._lift(target)
+        yield from self._raise()
         self.outcome = Outcome.DONE if touched else Outcome.MISSED
 
     def _place(self, position: Float64, T_map_base: Float64, turns: Sequence[float | None], clearance: float) -> Motion:
@@ -170,15 +176,25 @@ class Manipulator:
             self.outcome = Outcome.OUT_OF_REACH
             return
         height, above, down = best
+<<<<<<< HEAD
         yield from self.go(above)
+=======
+        yield from self._approach(above)
+>>>>>>> envs-tidy
         for share in np.linspace(0.0, 1.0, int(np.ceil(height / DOWN)) + 1)[1:]:
             yield from self.go({name: above[name] + share * (down[name] - above[name]) for name in ARM})
         yield from self.wait(2)
         self.cup.open()
         self.held = None
+<<<<<<< HEAD
         yield from self.wait(2)
         yield from self.go(above)
         yield from self.go(READY)
+=======
+        yield from self._wait(2)
+        yield from self._go(above)
+        yield from self._raise()
+>>>>>>> envs-tidy
         self.outcome = Outcome.DONE
 
     def _cup_for(
@@ -193,9 +209,25 @@ class Manipulator:
     def unfold(self) -> Motion:
         """From the tucked posture beside the robot to the one before its chest."""
         if self._tucked:
+<<<<<<< HEAD
             yield from self.go(ASIDE)
             self._tucked = False
         yield from self.go(READY)
+=======
+            yield from self._go(ASIDE)
+            yield from self._go(RAISED)
+            self._tucked = False
+
+    def _approach(self, joints: Mapping[str, float]) -> Motion:
+        """To joint angles with the cup over a place, and down to it at the end."""
+        yield from self._go({name: RAISED[name] if name in UPWARDS else angle for name, angle in joints.items()})
+        yield from self._go(joints)
+
+    def _raise(self) -> Motion:
+        """Up from where the arm is, and then before the chest: over whatever stands there."""
+        yield from self._go({name: RAISED[name] for name in UPWARDS})
+        yield from self._go(RAISED)
+>>>>>>> envs-tidy
 
     def _lift(self, target: Float64) -> Motion:
         _, joints = self._highest(target, None)

@@ -10,23 +10,16 @@ from simtrack.envs.arm import ArmKinematics
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import apply, inverse, transform_planar, yaw_of
 from simtrack.objects import ObjectModel
-from simtrack.perception.scene_graph import (
-    Body,
-    RelationConfig,
-    Shape,
-    map_entity_shape,
-    model_shapes,
-    relation_margin,
-)
+from simtrack.perception.scene_graph import MarginMeter, RelationConfig, map_entity_shape, model_shapes
 from simtrack.raycast import RayScene, TriangleMesh
 
 HOVER = 0.05
 """Metres above a place that must be within reach, too."""
 TURNS = np.deg2rad([0, 8, -8, 16, -16, 24, -24, 32, -32, 40, -40])
 """Bearings of a place, seen from the base, that are tried: radians."""
-RADII = np.arange(0.44, 0.65, 0.02)
+RADII = np.arange(0.45, 0.66, 0.03)
 """Metres from the base where places are sought."""
-BEARINGS = np.deg2rad(np.arange(-50.0, 51.0, 2.5))
+BEARINGS = np.deg2rad(np.arange(-48.0, 49.0, 4.0))
 """Radians, base frame, where places are sought."""
 HEADINGS = np.deg2rad(np.arange(0.0, 360.0, 30.0))
 """Turns about the vertical that are tried."""
@@ -91,30 +84,29 @@ class Places:
             models: class name -> model.
             goals: relations between classes and furniture that places will be sought for.
         """
-        self._models, self._config = models, RelationConfig()
+        self._models = models
         self._map = TriangleMesh(static_map.vertices, static_map.faces, "map")
         self._meshes = {n: TriangleMesh(m.mesh.vertices, m.mesh.faces, n) for n, m in models.items()}
-        self._shapes: dict[str, Shape] = model_shapes(models)
-        self._furniture: dict[str, Body] = {}
-        named = {goal.reference for goal in goals}
-        config = self._config
+        config, shapes = RelationConfig(), model_shapes(models)
+        self._furniture = {entity.name: entity.T_map_entity for entity in static_map.entities}
         for entity in static_map.entities:
-            if entity.name in named:
-                shape = map_entity_shape(entity, config.container_classes, config.layout_classes)
-                self._furniture[entity.name] = Body(shape, entity.T_map_entity)
+            if any(goal.reference == entity.name for goal in goals):
+                shapes[entity.name] = map_entity_shape(entity, config.container_classes, config.layout_classes)
+        self._meters = {g: MarginMeter(shapes[g.subject], g.name, shapes[g.reference], config) for g in goals}
 
     def margin(self, goal: Relation, belief: Belief) -> float:
         """Metres by which a goal is believed to hold, negative if it does not; -inf if a thing is not believed."""
-        subject, reference = (self._body(name, belief) for name in (goal.subject, goal.reference))
+        subject, reference = (self._pose(name, belief) for name in (goal.subject, goal.reference))
         if subject is None or reference is None:
             return -np.inf
-        return relation_margin(subject, goal.name, reference, self._config)
+        return self._meters[goal].margin(subject, reference)
 
-    def _body(self, name: str, belief: Belief) -> Body | None:
-        if name in self._furniture:
+    def _pose(self, name: str, belief: Belief) -> Float64 | None:
+        """(4, 4) where a thing is believed to be."""
+        if name not in self._models:
             return self._furniture[name]
         track = believed(belief, name)
-        return None if track is None else Body(self._shapes[name], track.T_map_object)
+        return None if track is None else track.T_map_object
 
     def spots(self, goal: Relation, belief: Belief, T_map_object: Float64) -> list[Spot]:
         """Where the goal's subject, once it is held, can be put down within reach so that the goal holds.
@@ -127,7 +119,7 @@ class Places:
         Returns:
             The best first; none if the reference is not believed or there is no room.
         """
-        reference = self._body(goal.reference, belief)
+        reference = self._pose(goal.reference, belief)
         if reference is None:
             return []
         model = self._models[goal.subject]
@@ -146,16 +138,15 @@ class Places:
             position = np.array([*place, level - bottom])
             T = transform_planar(*place, heading)
             T[2, 3] = position[2]
-            body = Body(self._shapes[goal.subject], T @ upright)
-            margin = relation_margin(body, goal.name, reference, self._config)
+            margin = self._meters[goal].margin(T @ upright, reference)
             if margin >= 0.0:
                 room = float(np.mean(far <= level + FLAT))
                 found.append(Spot(position, heading, min(margin, SAFE) / SAFE + 0.5 * room))
         return sorted(found, key=lambda spot: -spot.merit)
 
-    def _around(self, T_map_base: Float64, reference: Body) -> Iterator[Float64]:
+    def _around(self, T_map_base: Float64, T_map_reference: Float64) -> Iterator[Float64]:
         """Places (2,) of the map that the arm may reach: a grid about the base, and the middle of the reference."""
-        middle = reference.box.T_map_box[:2, 3]
+        middle = T_map_reference[:2, 3]
         R, here = T_map_base[:2, :2], T_map_base[:2, 3]
         shifts = [np.array([dx, dy]) for dx in (0.0, 0.01, -0.01) for dy in (0.0, 0.01, -0.01)]
         yield from (middle + shift for shift in shifts)

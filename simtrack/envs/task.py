@@ -56,6 +56,8 @@ class Task(ABC):
     """Length of an episode; then it is truncated."""
     macros: tuple[str, ...] = ()
     """Of `simtrack.envs.actions.MACROS`: what the arm can be asked for; the scene's robot needs ``suction`` for any."""
+    script: str = ""
+    """Name of the scripted policy that can play it (`simtrack.envs.policies.SCRIPTED`), if there is one."""
     goals: tuple[Relation, ...] = ()
     """What the agent is told that shall hold, between objects and furniture of the scene."""
 

@@ -12,7 +12,7 @@ from simtrack.errors import UnknownNameError
 from simtrack.geometry.transforms import apply, difference, inverse
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 from simtrack.simulation.contacts import SUPPORTING, contact_pairs
-from simtrack.simulation.history import KEY_NS, History
+from simtrack.simulation.history import History
 from simtrack.simulation.world import SENSOR_BODIES, World, body_pose
 from simtrack.simulation.world_rays import WorldRays
 
@@ -85,7 +85,7 @@ class GroundTruth:
         self._joints = {
             moving.part.name: int(world.model.joint(moving.joint).qposadr[0]) for moving in world.static.moving
         }
-        self._contacts = _ContactLog(world)
+        self._contacts = _ContactLog(world, history.key)
         self._alone: RayScene | None = None
         self._lidar: dict[int, Int32] = {}
         self._full: RayBundle | None = None
@@ -114,8 +114,8 @@ class GroundTruth:
     def at(self, stamp: int) -> Truth:
         """Everything at a stamp."""
         scratch = self._scratch
-        early = max(self._history.start, stamp - KEY_NS)
-        late = min(self._history.end, stamp + KEY_NS)
+        early = max(self._history.start, stamp - self._history.key)
+        late = min(self._history.end, stamp + self._history.key)
         around = []
         for moment in (early, late):
             self._history.load(moment, scratch)
@@ -283,9 +283,9 @@ class GroundTruth:
 class _ContactLog:
     """Contacts between things, kept only where they change."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, key: int) -> None:
         names = world.names
-        self._names = names
+        self._names, self._key = names, key
         robot = [k for k, name in enumerate(names) if name == "robot"]
         self._owner = np.where(np.isin(world.geom_owners, robot), -1, world.geom_owners)
         self._is_object = np.array([name in world.objects for name in names])
@@ -302,7 +302,7 @@ class _ContactLog:
 
     def append(self, data: "mujoco.MjData") -> None:
         contact = data.contact
-        stamp, self._count = self._count * KEY_NS, self._count + 1
+        stamp, self._count = self._count * self._key, self._count + 1
         geoms, apart, up = contact.geom, contact.dist > 0.0, contact.frame[:, 2]
         asleep = data.tree_asleep >= 0
         fingerprint = geoms.tobytes() + apart.tobytes() + (np.abs(up) > SUPPORTING).tobytes() + asleep.tobytes()

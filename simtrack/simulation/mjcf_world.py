@@ -20,7 +20,7 @@ from simtrack.geometry.transforms import apply, inverse, rotation_from_quaternio
 from simtrack.geometry.upright_boxes import upright_box
 from simtrack.objects import load_object
 from simtrack.objects.registry import catalogue
-from simtrack.simulation.building.parts import MovingPart, StaticPart, StaticWorld, polygon_area, room_at
+from simtrack.simulation.building.parts import MovingPart, StaticPart, StaticWorld, Support, polygon_area, room_at
 from simtrack.simulation.placement import blocking
 from simtrack.simulation.scene_file import SceneFile, parse_scene
 from simtrack.simulation.user_mjcf import geom_shape, read_model
@@ -67,15 +67,32 @@ def mjcf_scene(path: Path) -> SceneFile:
     return parse_scene(document, path)
 
 
-def mjcf_building(scene: SceneFile) -> StaticWorld:
-    """What is fixed in a scene's MJCF file, its floor at height 0.
+def mjcf_building(scene: SceneFile, *, supports: bool = True) -> StaticWorld:
+    """What is fixed in a scene's MJCF file, its floor at height 0; `supports`: with the faces that things stand on.
 
     Raises:
         FileFormatError: the scene names no MJCF file, or that cannot be used as a building.
     """
     if scene.mjcf_path is None:
         raise FileFormatError(scene.path, "mjcf", "missing; the builder 'mjcf' makes the building of this file")
-    return _Reading(scene.mjcf_path, scene.path.parent).building()
+    return _Reading(scene.mjcf_path, scene.path.parent).building(supports=supports)
+
+
+def level_faces(part: StaticPart) -> tuple[Support, ...]:
+    """Rectangles around the level planes of a part that look up, part frame."""
+    return tuple(_supports(part.mesh, np.eye(4)))
+
+
+def free_bodies(scene: SceneFile) -> dict[str, Float64]:
+    """Name of each free body that is no known object -> (2, 3) bounds of what is seen of it, map frame."""
+    assert scene.mjcf_path is not None
+    reading = _Reading(scene.mjcf_path, scene.path.parent)
+    known = {body for body, _ in reading.known_objects()}
+    return {
+        reading.name(body): mesh.bounds - (0.0, 0.0, reading.floor[1])
+        for body, mesh in reading.surfaces.items()
+        if reading.is_free(body) and body not in known
+    }
 
 
 def floor_height(scene: SceneFile) -> float:

@@ -112,7 +112,7 @@ class TidyPolicy:
             R = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
             if (yield from self._stand(spot.position + R @ (self._spot - origin))):
                 heading = spot.heading - yaw_of(self._belief.localization.T_map_base)
-                yield from self._ask(Request("place", self._in_base(spot.position), float(wrapped(heading))))
+                yield from self._ask(Request("place", self._in_base(spot.position), heading))
                 if not self._holds:
                     return
 
