@@ -80,6 +80,11 @@ class Front:
         return out / np.linalg.norm(out)
 
     @cached_property
+    def outwards_closed(self) -> Float64:
+        """(3,), horizontal: where it looks at the lower end of its joint, closed."""
+        return motion(self.articulation, self.articulation.lower)[:3, :3] @ self.outwards
+
+    @cached_property
     def spots(self) -> Float64:
         """(N, 3), with the joint at 0, map frame."""
         a = self.articulation
