@@ -19,7 +19,6 @@ READY: Mapping[str, float] = {
     "arm_6_joint": 1.12, "arm_7_joint": 0.0,
 }  # fmt: skip
 """Posture before the chest, above tables, with the cup pointing down: the search for joint angles begins here."""
-<<<<<<< HEAD
 LEVEL: Mapping[str, float] = {
     "arm_1_joint": 0.0, "arm_2_joint": -0.7, "arm_3_joint": 0.0, "arm_4_joint": 1.6, "arm_5_joint": 0.0,
     "arm_6_joint": -0.9, "arm_7_joint": 0.0,
@@ -27,14 +26,11 @@ LEVEL: Mapping[str, float] = {
 """Posture before the chest with the cup pointing forward, the elbow up: the search begins here if the cup shall not
 point down."""
 DOWN = np.array([0.0, 0.0, -1.0])
-ASIDE: Mapping[str, float] = {**READY, "arm_1_joint": -1.57}
-=======
 RAISED: Mapping[str, float] = {**READY, "arm_2_joint": -1.08, "arm_4_joint": 1.1, "arm_6_joint": 1.3}
 """The same 11 cm higher, with the cup tilted by 15 degrees: things are carried over others."""
 UPWARDS = ("arm_2_joint", "arm_4_joint", "arm_6_joint")
 """Joints that lead from `READY` to `RAISED`."""
 ASIDE: Mapping[str, float] = {**RAISED, "arm_1_joint": -1.57}
->>>>>>> envs-tidy
 """The same beside the robot: on the way from the tucked posture, over the edge of a table."""
 
 

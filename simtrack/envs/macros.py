@@ -136,13 +136,8 @@ class Manipulator:
         if above is None or self._solve(target, above) is None:
             self.outcome = Outcome.OUT_OF_REACH
             return
-<<<<<<< HEAD
         yield from self.unfold()
-        yield from self.go(above)
-=======
-        yield from self._unfold()
         yield from self._approach(above)
->>>>>>> envs-tidy
         touched = False
         for depth in np.arange(HOVER - DOWN, -DEEPER, -DOWN):
             lower = self._solve(target + (0.0, 0.0, float(depth)), self.joints())
@@ -176,25 +171,15 @@ class Manipulator:
             self.outcome = Outcome.OUT_OF_REACH
             return
         height, above, down = best
-<<<<<<< HEAD
-        yield from self.go(above)
-=======
         yield from self._approach(above)
->>>>>>> envs-tidy
         for share in np.linspace(0.0, 1.0, int(np.ceil(height / DOWN)) + 1)[1:]:
             yield from self.go({name: above[name] + share * (down[name] - above[name]) for name in ARM})
         yield from self.wait(2)
         self.cup.open()
         self.held = None
-<<<<<<< HEAD
         yield from self.wait(2)
         yield from self.go(above)
-        yield from self.go(READY)
-=======
-        yield from self._wait(2)
-        yield from self._go(above)
         yield from self._raise()
->>>>>>> envs-tidy
         self.outcome = Outcome.DONE
 
     def _cup_for(
@@ -209,25 +194,19 @@ class Manipulator:
     def unfold(self) -> Motion:
         """From the tucked posture beside the robot to the one before its chest."""
         if self._tucked:
-<<<<<<< HEAD
             yield from self.go(ASIDE)
-            self._tucked = False
-        yield from self.go(READY)
-=======
-            yield from self._go(ASIDE)
-            yield from self._go(RAISED)
+            yield from self.go(RAISED)
             self._tucked = False
 
     def _approach(self, joints: Mapping[str, float]) -> Motion:
         """To joint angles with the cup over a place, and down to it at the end."""
-        yield from self._go({name: RAISED[name] if name in UPWARDS else angle for name, angle in joints.items()})
-        yield from self._go(joints)
+        yield from self.go({name: RAISED[name] if name in UPWARDS else angle for name, angle in joints.items()})
+        yield from self.go(joints)
 
     def _raise(self) -> Motion:
         """Up from where the arm is, and then before the chest: over whatever stands there."""
-        yield from self._go({name: RAISED[name] for name in UPWARDS})
-        yield from self._go(RAISED)
->>>>>>> envs-tidy
+        yield from self.go({name: RAISED[name] for name in UPWARDS})
+        yield from self.go(RAISED)
 
     def _lift(self, target: Float64) -> Motion:
         _, joints = self._highest(target, None)
