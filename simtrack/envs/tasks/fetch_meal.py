@@ -47,6 +47,8 @@ class Appliance:
     """(4, 4), origin in its middle, x towards the door, z up."""
     size: Float64
     """(2,), metres, along x and y."""
+    headroom: float
+    """Metres of free height."""
 
 
 class FetchMeal(Task):
@@ -125,7 +127,7 @@ class FetchMeal(Task):
         """Whether the middle of something is inside of the microwave, above its board."""
         x, y, z = apply(inverse(self._inside.T_map_board), place[None])[0]
         half = self._inside.size / 2
-        return bool(abs(x) < half[0] and abs(y) < half[1] and 0.0 < z < HEADROOM)
+        return bool(abs(x) < half[0] and abs(y) < half[1] and 0.0 < z < self._inside.headroom)
 
 
 def appliance(world: StaticWorld, kind: str, heights: tuple[float, float], scene: SceneFile) -> Appliance:
@@ -167,7 +169,8 @@ def _boards(body: StaticPart, door: MovingPart, heights: tuple[float, float]) ->
         T_map_board = np.eye(4)
         T_map_board[:3, :3] = np.stack([front, side, [0.0, 0.0, 1.0]], axis=1)
         T_map_board[:3, 3] = T[:3, 3]
-        out.append(Appliance(body, door, number, T_map_board, size[::-1] if swapped else size))
+        headroom = min(above, top) - z
+        out.append(Appliance(body, door, number, T_map_board, size[::-1] if swapped else size, headroom))
     return out
 
 
@@ -197,7 +200,7 @@ def _covered(board: Appliance, taken: dict[str, Float64]) -> bool:
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         local = apply(T, corners)
         near, far = local.min(axis=0), local.max(axis=0)
-        if far[2] < -0.02 or near[2] > HEADROOM or near[0] > board.size[0] / 2 or far[0] < board.size[0] / 2 - 0.25:
+        if far[2] < -0.02 or near[2] > board.headroom - 0.03 or near[0] > board.size[0] / 2 or far[0] < board.size[0] / 2 - 0.25:
             continue
         if near[1] < 0.18 and far[1] > -0.18:
             return True
