@@ -8,7 +8,7 @@ import numpy as np
 from simtrack.contracts import NANOSECONDS, Articulation, Float32, Float64, JointEstimate, MapEntity, Track
 from simtrack.envs.actions import AXES, Outcome, Request, vector
 from simtrack.envs.arm import ArmKinematics
-from simtrack.envs.front_macros import STROKE
+from simtrack.envs.front_macros import LIFT, STROKE
 from simtrack.envs.fronts import BEFORE, COMFORT, Front, FrontReach, followed, turned
 from simtrack.envs.observations import OUTCOMES, decode
 from simtrack.envs.planning import believed
@@ -45,6 +45,8 @@ INTO = 0.075
 """Metres behind the edge of a board at which the middle of the item is put down."""
 HALF_WIDTH = 0.085
 """Metres to each side of the item's middle that must be free on its way: hand and item."""
+RUN_UP = 0.4
+"""Metres before the place where something is inserted from which the robot drives straight."""
 TRIES = 3
 
 
@@ -140,12 +142,15 @@ class FetchMealPolicy:
     def _insert(self) -> Plan:
         place, inwards = self._inside()
         yield from self._raise(float(np.clip(place[2] + 0.04 - COMFORT, 0.0, 0.35)))
-        stance = self._stance(place - (0.0, 0.0, 0.0) - 0.03 * inwards, inwards, STROKE, 0.03)
+        stance = self._stance(place - 0.03 * inwards, inwards, STROKE, LIFT, RUN_UP)
         if stance is None:
             yield self._move()
             return
-        yield from self._drive(stance)
+        before = stance.copy()  # with what is held stretched out, the last metre is driven straight
+        before[:2, 3] -= RUN_UP * stance[:2, 0]
         self._gaze = place
+        yield from self._drive(before)
+        yield from self._straight(RUN_UP)
         yield from self._wait(8)
         yield from self._ask(Request("insert", self._in_base(place)))
         yield from self._straight(-0.3)
@@ -213,9 +218,14 @@ class FetchMealPolicy:
                 break
         return None if best is None else best[1]
 
-    def _stance(self, place: Float64, inwards: Float64, stroke: float, lift: float) -> Float64 | None:
+    def _stance(
+        self, place: Float64, inwards: Float64, stroke: float, lift: float, run_up: float = 0.0
+    ) -> Float64 | None:
         """Where to stand so that a level cup goes straight to a place and has come from `stroke` metres before it."""
         for T in self._candidates(place, inwards):
+            behind = T[:2, 3] - run_up * T[:2, 0]
+            if self._floor.clearance_at(*behind.tolist()) < ROOM:
+                continue
             T_base_map = inverse(T)
             at, ahead = apply(T_base_map, place[None])[0] + (0.0, 0.0, lift), T_base_map[:3, :3] @ inwards
             inside = self._reach.joints(at, ahead, self._lift, level=True)

@@ -101,11 +101,12 @@ class FetchMeal(Task):
         inside = self._contains(item.T_map_object[:3, 3])
         free = moment.holding != ITEM
         resting = float(np.linalg.norm(item.velocity[:3])) < AT_REST
-        closed = inside and free and resting and microwave - low < CLOSED
+        inside = inside and free and resting
+        closed = inside and microwave - low < CLOSED
         now = {
             "opened": fridge - self._fridge_closed >= OPENED,
             "taken": moment.holding == ITEM,
-            "inside": inside and free,
+            "inside": inside,
             "closed": closed,
         }
         worth = {"opened": 1.0, "taken": 1.0, "inside": 1.0, "closed": 2.0}
