@@ -123,9 +123,7 @@ class ArmKinematics:
             q = np.clip(q + change, self._low, self._high)
         return None
 
-    def _error(
-        self, pose: Float64, position: Float64, yaw: float | None, direction: Float64
-    ) -> tuple[Float64, bool]:
+    def _error(self, pose: Float64, position: Float64, yaw: float | None, direction: Float64) -> tuple[Float64, bool]:
         """What is missing: metres, tilt, and, if asked for, turn about z instead of its z; and whether it is little."""
         gap = position - pose[:3, 3]
         axis = pose[:3, 0]

@@ -1,8 +1,8 @@
 """Macros that work from the front: open and close doors and drawers, take things off shelves, put things into cavities.
 
-All is done through physics: servos follow joint angles that bring the cup to where things are BELIEVED to be, the wheels
-follow a straight line where the arm alone does not reach, and the cup holds what it truly touches. No pose and no joint
-is ever set.
+All is done through physics: servos follow joint angles that bring the cup to where things are BELIEVED to be, the
+wheels follow a straight line where the arm alone does not reach, and the cup holds what it truly touches. No pose and
+no joint is ever set.
 """
 
 from collections.abc import Generator
@@ -11,6 +11,7 @@ import numpy as np
 
 from simtrack.contracts import Articulation, Float64
 from simtrack.envs.actions import Outcome
+from simtrack.envs.arm import RAISED
 from simtrack.envs.fronts import BEFORE, COMFORT, Front, FrontReach, flat_spots, followed, turned
 from simtrack.envs.macros import Held, Manipulator, Motion
 from simtrack.envs.settings import CONTROL_HZ
@@ -48,7 +49,7 @@ def articulate(m: Manipulator, articulation: Articulation, position: float, goal
     if begun is None or reach.follows(front, spot, (position, goal), start, m.torso()) is None:
         return m.refuse(Outcome.OUT_OF_REACH)
     above, _, direction = begun
-    lean = float(np.arctan2(*np.cross(inwards, direction)[[2]], inwards @ direction))
+    lean = float(np.arctan2(np.cross(inwards, direction)[2], inwards @ direction))
     yield from m.unfold()
     yield from m.go(above)
     if not (yield from _touch(m, reach, place, direction)):
@@ -70,12 +71,14 @@ def articulate(m: Manipulator, articulation: Articulation, position: float, goal
             m.follow(joints)
         yield
         if m.cup.check() is None:
-            yield from m.go(reach.joints(np.array([0.8, 0.0, COMFORT + m.torso()]), np.array([1.0, 0.0, 0.0]), m.torso()) or joints)
+            yield from _back_off(m, BACK)
+            yield from m.go(RAISED)
             m.outcome = Outcome.SLIPPED
             return
     m.cup.open()
     yield from m.wait(2)
     yield from _back_off(m, BACK)
+    yield from m.go(RAISED)
     m.outcome = Outcome.DONE
 
 

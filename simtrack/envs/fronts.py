@@ -28,8 +28,8 @@ FROM_EDGE = 0.1
 COMFORT = 0.65
 """Metres above the floor, with the torso down, at which the arm reaches farthest."""
 HAND, UPPER_ARM, FOREARM, SHOULDER_HEIGHT = 0.245, 0.345, 0.24, 0.66
-"""Metres: from wrist to rim, the arm's two long parts with what leads to them, the arm's first axis with the torso down;
-what is farther away than that need not be tried."""
+"""Metres: from wrist to rim, the arm's two long parts with what leads to them, the arm's first axis with the torso
+down; what is farther away than that need not be tried."""
 BEFORE = 0.12
 """Metres before a face from which the cup approaches it."""
 WAYPOINTS = 7
@@ -76,8 +76,8 @@ class Front:
         if a.kind == "prismatic":
             return a.axis
         arm = a.vertices.astype(float).mean(axis=0) - a.anchor
-        out = np.cross(a.axis, arm - (arm @ a.axis) * a.axis)
-        return out / np.linalg.norm(out)
+        out: Float64 = np.cross(a.axis, arm - (arm @ a.axis) * a.axis)
+        return out / float(np.linalg.norm(out))
 
     @cached_property
     def outwards_closed(self) -> Float64:

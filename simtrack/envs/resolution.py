@@ -37,7 +37,8 @@ def stack_config(scale: float) -> StackConfig:
     )
     joints = replace(stack.articulation, registration=tracker.registration)
     return replace(
-        stack, tracker=tracker, articulation=joints, presegmentation=seen, lidar_presegmentation_every=LIDAR_SEGMENTS)
+        stack, tracker=tracker, articulation=joints, presegmentation=seen, lidar_presegmentation_every=LIDAR_SEGMENTS
+    )
 
 
 def _registration(config: RegistrationConfig, scale: float) -> RegistrationConfig:

@@ -55,7 +55,9 @@ class BelievedScene:
         """Place the believed tracks where they are believed to be, and remove all others; doors as far open as that."""
         if self._parts:
             poses = believed_poses(self._articulations, joints)
-            self.scene.set_poses(range(MAP + 1, MAP + 1 + len(self._parts)), [poses[a.name] for a in self._articulations])
+            self.scene.set_poses(
+                range(MAP + 1, MAP + 1 + len(self._parts)), [poses[a.name] for a in self._articulations]
+            )
         believed = {len(self._parts) + t.id: t for t in tracks if t.believed}
         for instance in [i for i in self._placed if i not in believed]:
             self.scene.remove(instance)

@@ -329,9 +329,7 @@ class PerceptionStack:
         self._status["tracking"] = result.status
         return result
 
-    def _articulated(
-        self, frame: RgbdFrame, T_map_camera: Float64, covariance: Float64
-    ) -> tuple[JointEstimate, ...]:
+    def _articulated(self, frame: RgbdFrame, T_map_camera: Float64, covariance: Float64) -> tuple[JointEstimate, ...]:
         tracker = self.articulation
         if tracker is None:
             return ()

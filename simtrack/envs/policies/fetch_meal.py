@@ -159,7 +159,7 @@ class FetchMealPolicy:
         track = believed(self._belief, self._goal.subject)
         return self._outcome is Outcome.DONE or track is not None
 
-    # -------------------------------------------------------------------------------------------------- what is believed
+    # ------------------------------------------------------------------------------------------------- what is believed
 
     def _joint(self, articulation: Articulation) -> JointEstimate:
         return next(joint for joint in self._belief.joints if joint.name == articulation.name)
@@ -191,7 +191,7 @@ class FetchMealPolicy:
         local = np.array([size[0] / 2 - INTO, y, height])
         return apply(T_map_board, local[None])[0], -T_map_board[:3, 0]
 
-    # ------------------------------------------------------------------------------------------------------------ stances
+    # --------------------------------------------------------------------------------------------------------- stances
 
     def _candidates(self, place: Float64, inwards: Float64) -> Iterator[Float64]:
         """(4, 4) T_map_base from which a place is before the arm, the straightest first, on free floor."""
@@ -235,7 +235,7 @@ class FetchMealPolicy:
                 return T
         return None
 
-    # --------------------------------------------------------------------------------------------------------- movements
+    # ------------------------------------------------------------------------------------------------------- movements
 
     def _see(self, front: Front, *, move: bool = True) -> Plan:
         """Look at a door until it is known how far it is open."""
@@ -267,7 +267,7 @@ class FetchMealPolicy:
         if best is None:
             return
         ahead = place[:2] - best[1]
-        T = transform_planar(*best[1].tolist(), float(np.arctan2(ahead[1], ahead[0])))
+        T = transform_planar(float(best[1][0]), float(best[1][1]), float(np.arctan2(ahead[1], ahead[0])))
         yield from self._drive(T, near=0.12)
 
     def _look_for(self, name: str, place: Float64) -> Generator[Float32, None, Track | None]:
@@ -287,7 +287,7 @@ class FetchMealPolicy:
         path = self._floor.plan(self._belief.localization.T_map_base[:2, 3], goal)
         way = [goal] if path is None else [*path[3:].tolist(), goal]
         index = 0
-        for _ in range(500):
+        for _ in range(300):
             xy = self._belief.localization.T_map_base[:2, 3]
             while index < len(way) - 1 and float(np.linalg.norm(way[index] - xy)) < 0.25:
                 index += 1

@@ -8,11 +8,11 @@ import numpy as np
 from simtrack.contracts import Float64, Relation
 from simtrack.envs.task import Moment, Score, Task
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import apply, inverse
+from simtrack.geometry.transforms import apply, exp_so3, inverse
 from simtrack.objects import load_object
 from simtrack.simulation.building.parts import MovingPart, StaticPart, StaticWorld
 from simtrack.simulation.mjcf_world import free_bodies, level_faces, mjcf_building, mjcf_scene
-from simtrack.simulation.scene_file import SceneFile, StartRoom, parse_scene
+from simtrack.simulation.scene_file import SceneFile, parse_scene
 
 if TYPE_CHECKING:
     from simtrack.simulation.simulation import Simulation
@@ -33,6 +33,8 @@ ASIDE, TURN = 0.06, 0.15
 """Metres off the middle of the board, and radians off the direction to its front, at most."""
 AT_REST = 0.05
 """m/s."""
+WORTH = {"opened": 1.0, "taken": 1.0, "inside": 1.0, "closed": 2.0}
+"""Stage -> what the first time that it is reached is worth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +72,9 @@ class FetchMeal(Task):
         """
         if scene.static.builder == "room":
             from simtrack.simulation.building.rooms.functional import functional_room
-            from simtrack.simulation.building.rooms.plan import KINDS
+            from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
 
-            kind = next((kind for kind in KINDS if kind == scene.static.config.get("kind")), None)
+            kind: RoomKind | None = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
             scene = mjcf_scene(functional_room(scene.static.seed or 0, kind))
         if scene.static.builder != "mjcf":
             raise InvalidValueError("scene", scene.name, "a kitchen (kitchen:SEED), or an MJCF file of one")
@@ -90,7 +92,7 @@ class FetchMeal(Task):
 
     def begin(self, simulation: "Simulation", rng: np.random.Generator) -> None:
         """Nothing is done yet."""
-        self._stages = dict.fromkeys(("opened", "taken", "inside", "closed"), False)
+        self._stages: dict[str, bool] = dict.fromkeys(WORTH, False)
 
     def score(self, moment: Moment) -> Score:
         """See the class."""
@@ -109,8 +111,7 @@ class FetchMeal(Task):
             "inside": inside,
             "closed": closed,
         }
-        worth = {"opened": 1.0, "taken": 1.0, "inside": 1.0, "closed": 2.0}
-        reward = sum(worth[stage] for stage, done in now.items() if done and not self._stages[stage])
+        reward = sum(WORTH[stage] for stage, done in now.items() if done and not self._stages[stage])
         self._stages = {stage: done or now[stage] for stage, done in self._stages.items()}
         metrics = {
             "fridge": fridge - self._fridge_closed,
@@ -187,8 +188,6 @@ def outwards(door: MovingPart) -> Float64:
 
 def _closed_direction(out: Float64, door: MovingPart) -> Float64:
     """The direction at the joint's lower end, which is where the door is closed; 0 is where it was seen."""
-    from simtrack.geometry.transforms import exp_so3
-
     return exp_so3(door.lower * door.axis) @ out
 
 
@@ -201,7 +200,12 @@ def _covered(board: Appliance, taken: dict[str, Float64]) -> bool:
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         local = apply(T, corners)
         near, far = local.min(axis=0), local.max(axis=0)
-        if far[2] < -0.02 or near[2] > board.headroom - 0.03 or near[0] > board.size[0] / 2 or far[0] < board.size[0] / 2 - 0.25:
+        if (
+            far[2] < -0.02
+            or near[2] > board.headroom - 0.03
+            or near[0] > board.size[0] / 2
+            or far[0] < board.size[0] / 2 - 0.25
+        ):
             continue
         if near[1] < 0.18 and far[1] > -0.18:
             return True

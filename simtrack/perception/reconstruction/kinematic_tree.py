@@ -113,9 +113,7 @@ def _parts_in_order(candidate: CadCandidate) -> list[str]:
     return [candidate.model.parts[0].name, *(joint.child for joint in candidate.model.joints)]
 
 
-def bodies_of(
-    candidate: CadCandidate, name: str, joint: BodyJoint, semantic_class: str, taken: set[str]
-) -> list[Body]:
+def bodies_of(candidate: CadCandidate, name: str, joint: BodyJoint, semantic_class: str, taken: set[str]) -> list[Body]:
     """Base and moving parts; the frame of a moving part is at the anchor of its joint."""
     model, scale = candidate.model, candidate.scale
     poses = model.part_poses(candidate.positions)

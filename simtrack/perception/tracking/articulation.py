@@ -44,6 +44,10 @@ class ArticulationConfig:
     """Scale of the Geman-McClure kernel, standard deviations."""
     rays: int = 1200
     """About the largest number of rays in a cast."""
+    search_rays: int = 300
+    """As `rays`, where the whole range is tried."""
+    rest: float = 0.002
+    """Metres of the outermost point: a joint that one step moves by less than this is where it was."""
     min_rays: int = 24
     """Fewest confirming rays for a registration to count."""
     keep_support: float = 0.6
@@ -145,7 +149,9 @@ class ArticulationTracker:
         for k, a in enumerate(self.articulations, 1):
             self._scene.add(TriangleMesh(a.vertices, a.faces), instance=k)
             low, high = a.vertices.min(axis=0).astype(float), a.vertices.max(axis=0).astype(float)
-            self._corners.append(np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low)
+            self._corners.append(
+                np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
+            )
             self._levers.append(_lever(a))
             self._states.append(_State(min(max(0.0, a.lower), a.upper), uniform_variance(a)))
         self._points = kernels.Points.room(0)
@@ -228,7 +234,7 @@ class ArticulationTracker:
         """Register a joint from its prediction; False if that leads nowhere and the range is worth a search."""
         if state.last_seen is None or state.status is TrackStatus.LOST:
             return False
-        found = self._register(k, view, state.position)
+        found = self._resting(k, view, state.position) or self._register(k, view, state.position)
         if self._sound(found):
             self._fuse(k, state, found, view, stamp)
             return True
@@ -269,10 +275,10 @@ class ArticulationTracker:
         a, state, config = self.articulations[k], self._states[k], self.config
         count = int(np.ceil((a.upper - a.lower) * self._levers[k] / config.spacing)) + 1
         tried = np.linspace(a.lower, a.upper, max(count, 3))
-        fits = [self._judge(k, view, float(q), config.gates[0]) for q in tried]
+        fits = [self._judge(k, view, float(q), config.gates[0], config.search_rays) for q in tried]
         scores = np.array([one.score for one in fits])
         padded = np.concatenate([[-np.inf], scores, [-np.inf]])
-        peaks = np.flatnonzero((scores >= padded[:-2]) & (scores >= padded[2:]) & (scores >= config.min_rays))
+        peaks = np.flatnonzero((scores >= padded[:-2]) & (scores >= padded[2:]) & (scores >= config.min_rays // 3))
         best = sorted((self._register(k, view, float(tried[i])) for i in peaks[np.argsort(-scores[peaks])][:3]),
                       key=lambda one: -one.score)  # fmt: skip
         best = [one for one in best if self._sound(one)]
@@ -303,12 +309,24 @@ class ArticulationTracker:
             position = min(max(position + min(max(step, -limit), limit), a.lower), a.upper)
         return self._judge(k, view, position, self.config.gates[-1])
 
-    def _judge(self, k: int, view: "_View", position: float, gate: float) -> JointFit:
-        _, variance, counts = self._linearised(k, view, position, gate)
-        rays = int(counts.sum())
-        return JointFit(position, variance, rays, int(counts[kernels.SUPPORTED]), int(counts[kernels.MISSING]))
+    def _resting(self, k: int, view: "_View", position: float) -> JointFit | None:
+        """The verdict on where a joint is believed to be, if a single cast says that it is there."""
+        step, variance, counts = self._linearised(k, view, position, self.config.gates[-1])
+        found = JointFit(
+            position + step, variance, int(counts.sum()), int(counts[kernels.SUPPORTED]), int(counts[kernels.MISSING])
+        )
+        near = abs(step) * self._levers[k] < self.config.rest
+        return found if near and self._sound(found) else None
 
-    def _linearised(self, k: int, view: "_View", position: float, gate: float) -> tuple[float, float, Float64]:
+    def _judge(self, k: int, view: "_View", position: float, gate: float, rays: int | None = None) -> JointFit:
+        _, variance, counts = self._linearised(k, view, position, gate, rays)
+        return JointFit(
+            position, variance, int(counts.sum()), int(counts[kernels.SUPPORTED]), int(counts[kernels.MISSING])
+        )
+
+    def _linearised(
+        self, k: int, view: "_View", position: float, gate: float, rays: int | None = None
+    ) -> tuple[float, float, Float64]:
         """Gauss-Newton step, variance, and counts of rays (kernels.FIELDS,) at a position."""
         config, a = self.config.registration, self.articulations[k]
         T_camera_part = self._place(k, position, view)
@@ -317,7 +335,7 @@ class ArticulationTracker:
         if window is None:
             return 0.0, np.inf, counts[0]
         area = (window[2] - window[0]) * (window[3] - window[1])
-        stride = max(1, int(np.sqrt(area / self.config.rays)))
+        stride = max(1, int(np.sqrt(area / (rays or self.config.rays))))
         bundle = RayBundle.from_windows(view.intrinsics, [window], stride)
         hits = self._scene.cast(bundle, np.eye(4), coherent=None if stride == 1 else False)
         if len(bundle) > len(self._points.weight):
@@ -405,9 +423,7 @@ def _window(corners: Float64, intrinsics: CameraIntrinsics) -> tuple[int, int, i
     return (u0, v0, u1, v1) if u0 < u1 and v0 < v1 else None
 
 
-def believed_poses(
-    articulations: Sequence[Articulation], joints: Sequence[JointEstimate]
-) -> Mapping[str, Float64]:
+def believed_poses(articulations: Sequence[Articulation], joints: Sequence[JointEstimate]) -> Mapping[str, Float64]:
     """Name -> (4, 4) displacement in the map of each part where its joint is believed to be, 0 if nothing is known."""
     positions = {joint.name: joint.position for joint in joints}
     return {a.name: motion(a, positions.get(a.name, min(max(0.0, a.lower), a.upper))) for a in articulations}

@@ -101,6 +101,7 @@ def test_the_column_is_the_derivative_of_the_points_along_their_normals(
 def test_never_seen_joints_are_found_anywhere_in_their_range(seed: int, door: float, drawer: float) -> None:
     rng = np.random.default_rng(seed)
     tracker = ArticulationTracker(MAP)
+    joints = tracker.estimates(0)
     for stamp in range(6):
         joints = tracker.update(frame(stamp * 100_000_000, image((door, drawer), rng)), T_MAP_CAMERA, CERTAIN)
     tracker.close()
@@ -125,12 +126,11 @@ def test_a_moving_door_is_followed_within_its_limits() -> None:
 
 def test_what_stands_before_a_door_does_not_pull_it_and_unseen_ones_become_uncertain() -> None:
     rng, tracker = np.random.default_rng(2), ArticulationTracker(MAP)
+    joints = tracker.estimates(0)
     for k in range(6):
         tracker.update(frame(k * 100_000_000, image((0.7, 0.0), rng)), T_MAP_CAMERA, CERTAIN)
     for k in range(6, 12):
-        joints = tracker.update(
-            frame(k * 100_000_000, image((0.7, 0.0), rng, before=ARM)), T_MAP_CAMERA, CERTAIN
-        )
+        joints = tracker.update(frame(k * 100_000_000, image((0.7, 0.0), rng, before=ARM)), T_MAP_CAMERA, CERTAIN)
         assert abs(joints[0].position - 0.7) < np.radians(1.0)
     seen, wall = joints[0], block((-1.0, -1.0, 0.0), (-0.98, 1.0, 2.0))
     deviations = [seen.variance]
@@ -155,6 +155,7 @@ def test_own_pixels_say_nothing() -> None:
 
 def test_a_door_that_was_moved_unseen_is_found_again() -> None:
     rng, tracker = np.random.default_rng(4), ArticulationTracker(MAP)
+    joints = tracker.estimates(0)
     for k, truth in enumerate([0.2] * 5 + [1.3] * 5):
         joints = tracker.update(frame(k * 100_000_000, image((truth, 0.0), rng)), T_MAP_CAMERA, CERTAIN)
     tracker.close()
