@@ -76,7 +76,7 @@ class Front:
         if a.kind == "prismatic":
             return a.axis
         arm = a.vertices.astype(float).mean(axis=0) - a.anchor
-        out: Float64 = np.cross(a.axis, arm - (arm @ a.axis) * a.axis)
+        out = np.asarray(np.cross(a.axis, arm - (arm @ a.axis) * a.axis), np.float64)
         return out / float(np.linalg.norm(out))
 
     @cached_property

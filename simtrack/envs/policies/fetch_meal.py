@@ -23,7 +23,7 @@ Plan: TypeAlias = Generator[Float32, None, None]
 Tried: TypeAlias = Generator[Float32, None, bool]
 """The same, and whether it worked."""
 
-FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad(82.0), np.deg2rad(64.0)
+FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad(82.0), np.deg2rad(72.0)
 """Radians: far enough to reach in; a microwave's door is pushed shut again from the front."""
 NEARLY = np.deg2rad(9.0)
 """Radians off the wanted position that do not matter."""
@@ -140,9 +140,9 @@ class FetchMealPolicy:
         return False
 
     def _insert(self) -> Plan:
-        place, inwards = self._inside()
+        place, inwards, side = self._inside()
         yield from self._raise(float(np.clip(place[2] + 0.04 - COMFORT, 0.0, 0.35)))
-        stance = self._stance(place - 0.03 * inwards, inwards, STROKE, LIFT, RUN_UP)
+        stance = self._stance(place - 0.03 * inwards, inwards, STROKE, LIFT, RUN_UP, side)
         if stance is None:
             yield self._move()
             return
@@ -174,30 +174,35 @@ class FetchMealPolicy:
         middle[2] = min(max(0.85, door[:, 2].min()), door[:, 2].max())
         return middle - 0.1 * self._fridge.outwards_closed
 
-    def _inside(self) -> tuple[Float64, Float64]:
-        """(3,) where the item shall be in the microwave, and (3,) the direction in, past the door as it is now."""
+    def _inside(self) -> tuple[Float64, Float64, float]:
+        """(3,) where the item shall be in the microwave, and (3,) the direction in, past the door as it is now.
+
+        Last, 1 if the door's hinge is on the left of who looks in, else -1: there the robot should not stand.
+        """
         T_map_board, size = self._board
         a = self._microwave.articulation
         opened = self._joint(a).position - a.lower
         hinge = float(apply(inverse(T_map_board), a.anchor[None])[0][1])
         width = float(np.ptp((a.vertices - a.anchor) @ T_map_board[:3, 1]))
-        side = -np.sign(hinge)
-        covered = side * (abs(hinge) - width * np.cos(opened) - 0.01) * -1.0
-        low, high = -size[1] / 2 + HALF_WIDTH, size[1] / 2 - HALF_WIDTH
+        side = -float(np.sign(hinge))
+        tip = hinge + side * width * float(np.cos(opened))
+        far = side * (size[1] / 2 - HALF_WIDTH)
         # From the leaf's tip to the far wall there has to be room for the hand.
-        free = covered + side * HALF_WIDTH
-        y = float(np.clip(0.0 if side * free < 0.0 else free, min(low, high), max(low, high)))
+        y = side * min(max(side * tip + HALF_WIDTH + 0.01, 0.0), max(side * far, 0.0))
         height = float(self._briefing.models[self._goal.subject].extents[2]) / 2
         local = np.array([size[0] / 2 - INTO, y, height])
-        return apply(T_map_board, local[None])[0], -T_map_board[:3, 0]
+        return apply(T_map_board, local[None])[0], -T_map_board[:3, 0], side
 
     # --------------------------------------------------------------------------------------------------------- stances
 
-    def _candidates(self, place: Float64, inwards: Float64) -> Iterator[Float64]:
-        """(4, 4) T_map_base from which a place is before the arm, the straightest first, on free floor."""
+    def _candidates(self, place: Float64, inwards: Float64, side: float = 0.0) -> Iterator[Float64]:
+        """(4, 4) T_map_base from which a place is before the arm, the straightest first, on free floor.
+
+        With a `side` of 1 or -1 the place is rather to the left or right of the robot.
+        """
         for turn in TURNS.tolist():
             ahead = turned(inwards, turn)
-            for left in ASIDE:
+            for left in sorted(ASIDE, key=lambda left: -side * left):
                 for forward in AHEAD:
                     T = transform_planar(0.0, 0.0, float(np.arctan2(ahead[1], ahead[0])))
                     T[:2, 3] = place[:2] - (T[:3, :3] @ [forward, left, 0.0])[:2]
@@ -219,10 +224,10 @@ class FetchMealPolicy:
         return None if best is None else best[1]
 
     def _stance(
-        self, place: Float64, inwards: Float64, stroke: float, lift: float, run_up: float = 0.0
+        self, place: Float64, inwards: Float64, stroke: float, lift: float, run_up: float = 0.0, side: float = 0.0
     ) -> Float64 | None:
         """Where to stand so that a level cup goes straight to a place and has come from `stroke` metres before it."""
-        for T in self._candidates(place, inwards):
+        for T in self._candidates(place, inwards, side):
             behind = T[:2, 3] - run_up * T[:2, 0]
             if self._floor.clearance_at(*behind.tolist()) < ROOM:
                 continue
