@@ -158,7 +158,7 @@ class PaperFrame:
         if method == "umeyama":
             solver.umeyama(self.points, pairs, centres, rotations, shifts, 10)
         else:
-            settings = solver.SolverSettings(4.0, 3.0, solver.EDGES_NEVER, 0.0015, 0.01, 0.03, np.deg2rad(5.0))
+            settings = solver.SolverSettings(4.0, 3.0, solver.EDGES_NEVER, 0.0015, 0.01, 0.03, np.deg2rad(5.0), 0.0)
             solver.gauss_newton(
                 self.points, pairs, self.edges, 0, self.intrinsics, centres, rotations, shifts, self.radii,
                 np.ones((count, 2)), active, settings, 3, covariance, np.zeros(count, np.int64), np.zeros((count, 3)),

@@ -22,6 +22,7 @@ def env(
     keypoint_error: float | None = None,
     video: Path | None = None,
     record: Path | None = None,
+    record_as: Literal["mcap", "bop"] = "mcap",
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
     threads: int = 1,
 ) -> int:
@@ -40,7 +41,8 @@ def env(
         miss_rate: Share of visible objects that the detector does not find; the oracle's own if not given.
         keypoint_error: Median error of the detector's keypoints as a share of the object's size.
         video: Write a video of all episodes to this file.
-        record: Write an MCAP log of each episode to this folder.
+        record: Record each episode to this folder.
+        record_as: Logs that simtrack replay reads, or a data set in the format of BOP.
         json_file: Keep the figures of each episode in this file; those that it has already are not played again.
         threads: Threads of the compiled kernels.
     """
@@ -64,7 +66,7 @@ def env(
         if len(scene) > 1:
             print(f"{name}:", flush=True)
         seeds = range(seed, seed + episodes)
-        columns.append(_played(full_id(env_id), policy, feed, seeds, chosen, *files))
+        columns.append(_played(full_id(env_id), policy, feed, seeds, chosen, *files, record_as))
     rows = [("success", *(f"{sum(r.success for r in results)}/{episodes}" for results in columns))]
     rows += [("return", *(f"{sum(r.total for r in results) / episodes:.3f}" for results in columns))]
     for name in columns[0][0].metrics:
@@ -88,10 +90,12 @@ def _played(
     json_file: Path | None,
     video: Path | None,
     record: Path | None,
+    record_as: str,
 ) -> "list[EpisodeResult]":
     """Episodes of one scene; those that the file has are not played again."""
     import gymnasium as gym
 
+    from simtrack.envs.bop_recorder import BopRecorder
     from simtrack.envs.episodes import EpisodeFile
     from simtrack.envs.play import play
     from simtrack.envs.wrappers import Recorder, Video
@@ -100,7 +104,7 @@ def _played(
     if video is not None:
         made = Video(made, video)
     if record is not None:
-        made = Recorder(made, record)
+        made = Recorder(made, record) if record_as == "mcap" else BopRecorder(made, record)
     with made:
         kept = None
         if json_file is not None:

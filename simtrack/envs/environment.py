@@ -245,7 +245,7 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         if self._view is None:
             from simtrack.envs.view import View
 
-            self._view = View(self._loop.simulation)
+            self._view = View(self._loop.simulation, self.task.eye, self.task.focus)
         picture = self._view.picture(self._snapshot.truth)
         if self.render_mode == "rgb_array":
             return picture

@@ -1,7 +1,6 @@
 """Results of episodes in a file, so that a run that was stopped carries on."""
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -40,4 +39,4 @@ class EpisodeFile:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = self.path.with_suffix(".part")
         unfinished.write_text(json.dumps({"arguments": self._arguments, "episodes": episodes}, indent=1) + "\n")
-        os.replace(unfinished, self.path)
+        unfinished.replace(self.path)

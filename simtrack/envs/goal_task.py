@@ -1,4 +1,4 @@
-"""Tasks that are stated as relations: ``relay in materialbox``. One's own is a scene, goals and, if wanted, a reward."""
+"""Tasks that are stated as relations: ``relay in materialbox``. One's own is a scene, goals, and a reward if wanted."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -25,6 +25,7 @@ class GoalTask(Task):
 
     macros = ("grasp", "place")
     script = "tidy"
+    eye, focus = (0.35, 1.25, 1.35), (0.5, 0.0, 0.85)
     haste: float = 0.002
     """What a step costs."""
 

@@ -136,7 +136,7 @@ class Places:
             if not np.isfinite(under).all() or np.ptp(under) > FLAT or near.max() > level + FLAT:
                 continue
             position = np.array([*place, level - bottom])
-            T = transform_planar(*place, heading)
+            T = transform_planar(float(place[0]), float(place[1]), heading)
             T[2, 3] = position[2]
             margin = self._meters[goal].margin(T @ upright, reference)
             if margin >= 0.0:

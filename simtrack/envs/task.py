@@ -56,6 +56,9 @@ class Task(ABC):
     """Length of an episode; then it is truncated."""
     macros: tuple[str, ...] = ()
     """Of `simtrack.envs.actions.MACROS`: what the arm can be asked for; the scene's robot needs ``suction`` for any."""
+    eye: tuple[float, float, float] = (-1.7, 0.8, 2.0)
+    focus: tuple[float, float, float] = (1.0, 0.0, 0.75)
+    """From where pictures of the robot at work are taken, and what they show: base frame, metres."""
     script: str = ""
     """Name of the scripted policy that can play it (`simtrack.envs.policies.SCRIPTED`), if there is one."""
     goals: tuple[Relation, ...] = ()

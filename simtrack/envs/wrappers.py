@@ -151,7 +151,7 @@ class Video(gym.Wrapper):
         if loop is None or snapshot is None:
             raise RenderingError("there is nothing to be seen before the first reset")
         if self._view is None:
-            self._view = View(loop.simulation)
+            self._view = View(loop.simulation, self._inner.task.eye, self._inner.task.focus)
         picture = self._view.picture(snapshot.truth)
         pose = self._view.pose(snapshot.truth)
         picture = draw_belief(picture, INTRINSICS, pose, snapshot.belief, loop.simulation.models)

@@ -151,6 +151,15 @@ def interpolate(T_a: Float64, T_b: Float64, fraction: float) -> Float64:
     return perturb(T_a, fraction * xi)
 
 
+def with_lever(covariance: Float64, lever: Float64) -> Float64:
+    """(6, 6) covariance of a left perturbation, of a body that is carried along at the end of a lever (3,), metres."""
+    S = skew(lever)
+    out = covariance.copy()
+    out[:3] -= S @ covariance[3:]
+    out[:, :3] -= out[:, 3:] @ S.T
+    return out
+
+
 def rotate_covariance(rotation: Float64, covariance: Float64) -> Float64:
     """(6, 6) covariance of a left perturbation, expressed in the frame reached by a (3, 3) rotation."""
     out = np.empty((6, 6))

@@ -7,6 +7,7 @@ follows from the stamps alone. Where the machine is fast enough the answer is th
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from threading import Condition
 from typing import Generic, TypeVar
 
 from simtrack.contracts import NANOSECONDS
@@ -64,6 +65,52 @@ class Beside(Generic[T]):
     def drop(self) -> None:
         """Forget the piece; its thread finishes it all the same."""
         self._work = None
+
+
+class Paced(Generic[T]):
+    """A piece of work that counts its steps, each of which is taken to need the same time of the sensor's clock.
+
+    For work whose length is not known before: it is settled when its own steps say so, on any machine.
+    """
+
+    def __init__(self, thread: ThreadPoolExecutor, seconds: float, work: Callable[[Callable[[], None]], T]) -> None:
+        """Begin, or queue behind what the thread has to do.
+
+        Args:
+            thread: of `worker`.
+            seconds: of a step.
+            work: gets a function to call before every step.
+        """
+        self._step = round(seconds * NANOSECONDS)
+        self._steps, self._ended, self._changed = 0, False, Condition()
+        self._future = thread.submit(self._run, work)
+
+    def _run(self, work: Callable[[Callable[[], None]], T]) -> T:
+        try:
+            return work(self._count)
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify()
+
+    def _count(self) -> None:
+        with self._changed:
+            self._steps += 1
+            self._changed.notify()
+
+    def end(self, start: int, stamp: int) -> int | None:
+        """When the work ends that is taken to start at `start`, if that is by `stamp`; all nanoseconds.
+
+        Waits until that is known: until the work ends, or has taken more steps than there is time for.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._ended or start + self._steps * self._step > stamp)
+            end = start + self._steps * self._step
+        return end if end <= stamp else None
+
+    def settle(self) -> T:
+        """The answer. Raises what the work raised."""
+        return self._future.result()
 
 
 def _timed(work: Callable[[], T]) -> tuple[T, float]:

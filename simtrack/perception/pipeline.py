@@ -52,7 +52,7 @@ from simtrack.contracts import (
     TrackerResult,
 )
 from simtrack.geometry.kinematics import KinematicTree
-from simtrack.geometry.transforms import is_rigid, skew
+from simtrack.geometry.transforms import is_rigid, with_lever
 from simtrack.objects import ObjectModel
 from simtrack.perception.believed_scene import MAP, BelievedScene
 from simtrack.perception.beside import Beside, worker
@@ -435,6 +435,4 @@ def _usable(frame: RgbdFrame) -> bool:
 
 def _camera_covariance(localization: Localization, T_map_camera: Float64) -> Float64:
     """(6, 6) covariance of the camera's pose in the map: that of the base with the lever arm between them."""
-    J = np.eye(6)
-    J[:3, 3:] = -skew(T_map_camera[:3, 3] - localization.T_map_base[:3, 3])
-    return J @ localization.covariance @ J.T
+    return with_lever(localization.covariance, T_map_camera[:3, 3] - localization.T_map_base[:3, 3])

@@ -98,8 +98,8 @@ class Simulation:
 
         if servo not in (TIMESTEP_NS, KEY_NS):
             raise InvalidValueError("servo", servo, f"{TIMESTEP_NS} or {KEY_NS} ns")
-        if key < KEY_NS or key % KEY_NS or camera.period % key:
-            raise InvalidValueError("key", key, f"a multiple of {KEY_NS} ns of which the camera's period is one")
+        if key < KEY_NS or key % KEY_NS:
+            raise InvalidValueError("key", key, f"a multiple of {KEY_NS} ns")
         if unknown := sorted(set(sensors) - set(SENSORS)):
             raise UnknownNameError("sensor", unknown[0], SENSORS)
         self.scene, self.seed = scene, seed

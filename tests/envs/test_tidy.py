@@ -88,7 +88,7 @@ def test_what_cannot_be_done_is_told_at_once(tidy: SimtrackEnv) -> None:
 def test_named_things_are_grasped_and_put_where_they_belong(tidy: SimtrackEnv) -> None:
     env = DiscreteActions(tidy)
     flat = FlatBelief(tidy)
-    _, info = env.reset(seed=1)
+    observation, info = env.reset(seed=1)
     assert {"grasp relay", "put in materialbox", "put left-of screwdriver"} < set(env.names)
     rewards = []
     for skill in ("grasp relay", "put in materialbox"):

@@ -25,7 +25,7 @@ from simtrack.geometry.meshes import box_mesh
 from simtrack.geometry.transforms import transform
 from simtrack.objects.tiago import tiago
 from simtrack.perception import beside
-from simtrack.perception.beside import Beside, worker
+from simtrack.perception.beside import Beside, Paced, worker
 from simtrack.perception.pipeline import PerceptionStack, StackConfig
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 
@@ -167,3 +167,36 @@ def test_what_the_work_raises_is_raised_where_it_is_settled() -> None:
 def test_the_past_cannot_be_waited_for() -> None:
     with pytest.raises(InvalidValueError, match=">= 0 s"):
         Beside[None](worker("test"), -1.0)
+
+
+def test_a_piece_ends_when_its_own_steps_say_so_however_slow_the_machine() -> None:
+    thread, go_on = worker("test"), threading.Event()
+
+    def work(step: Callable[[], None]) -> str:
+        step()
+        step()
+        go_on.wait()
+        step()
+        return "done"
+
+    piece = Paced[str](thread, 1e-6, work)
+    assert piece.end(5_000, 6_000) is None  # known after two steps: no need to wait for the third
+    go_on.set()
+    assert piece.end(5_000, 7_999) is None
+    assert piece.end(5_000, 8_000) == 8_000
+    assert piece.end(7_000, 20_000) == 10_000
+    assert piece.settle() == "done"
+    thread.shutdown()
+
+
+def test_a_piece_that_fails_ends() -> None:
+    def fail(step: Callable[[], None]) -> None:
+        step()
+        raise ValueError("no data")
+
+    thread = worker("test")
+    piece = Paced[None](thread, 1e-6, fail)
+    assert piece.end(0, 1_000_000) == 1_000
+    with pytest.raises(ValueError, match="no data"):
+        piece.settle()
+    thread.shutdown()

@@ -1,11 +1,12 @@
 """Tidies up: grasps what is not where it should be, and puts it where the goal will hold. Sees beliefs only."""
 
 from collections.abc import Generator
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from simtrack.contracts import NANOSECONDS, Float32, Float64, Relation
+from simtrack.contracts import NANOSECONDS, Belief, Float32, Float64, Relation, Track
 from simtrack.envs.actions import AXES, Outcome, Request, vector
 from simtrack.envs.grasps import suction_spot
 from simtrack.envs.observations import OUTCOMES, decode
@@ -19,6 +20,8 @@ Plan: TypeAlias = Generator[Float32, None, None]
 
 FRESH = 1.0
 """Seconds since a thing was seen, up to which it may be grasped."""
+MEMORY = 20
+"""Seconds for which a thing is remembered that is not believed any more."""
 SETTLED = 8
 """Steps that a thing is looked at before it is grasped."""
 TURN_GAIN, TURN_LEAST = 1.5, 0.03
@@ -47,15 +50,25 @@ class TidyPolicy:
     def begin(self, rng: np.random.Generator) -> None:
         """See `simtrack.envs.policies.Policy`."""
         self._plan = self._tidy()
+        self._memory: dict[str, Track] = {}
 
     def act(self, observation: Any) -> Float32:
         """See `simtrack.envs.policies.Policy`."""
         arrays = self._briefing.arrays(observation, self._mode)
-        self._belief, _ = decode(arrays, self._briefing.layout, self._briefing.robot)
+        belief, _ = decode(arrays, self._briefing.layout, self._briefing.robot)
+        self._belief = self._remembered(belief)
         self._outcome = OUTCOMES[int(np.argmax(arrays["macro"]))]
         self._holds = bool(arrays["holding"].any())
         self._pan, _, self._torso = arrays["joints"].tolist()
         return next(self._plan)
+
+    def _remembered(self, belief: Belief) -> Belief:
+        """The belief, with what was believed a while ago and has only been hidden since, by the arm for instance."""
+        self._memory |= {track.class_name: track for track in belief.tracks if track.believed}
+        oldest = belief.stamp - MEMORY * NANOSECONDS
+        now = {track.class_name for track in belief.tracks if track.believed}
+        kept = (t for name, t in self._memory.items() if name not in now and t.last_seen >= oldest)
+        return replace(belief, tracks=(*belief.tracks, *kept))
 
     # ----------------------------------------------------------------------------------------------------------- plans
 
@@ -98,14 +111,19 @@ class TidyPolicy:
         if spot is None or not (yield from self._stand(spot)):
             return
         track = believed(self._belief, name)
-        if track is not None:
-            self._grasped = track.T_map_object
-            self._spot = suction_spot(self._briefing.models[name], track.T_map_object)
+        spot = None if track is None else suction_spot(self._briefing.models[name], track.T_map_object)
+        if track is not None and spot is not None:
+            self._grasped, self._spot = track.T_map_object, spot
             yield from self._ask(Request("grasp", self._in_base(track.T_map_object[:3, 3])))
+            if self._holds:
+                self._memory.pop(name, None)
 
     def _put(self, goal: Relation) -> Plan:
         """Try places until one is within reach; if none is, what is held goes back to where it was."""
         spots = self._places.spots(goal, self._belief, self._grasped)
+        if not spots:
+            yield from self._look_for(goal.reference)
+            spots = self._places.spots(goal, self._belief, self._grasped)
         origin = self._grasped[:3, 3]
         for spot in [*spots[:: max(1, len(spots) // TRIES)], Spot(origin, yaw_of(self._grasped), 0.0)]:
             turn = spot.heading - yaw_of(self._grasped)

@@ -8,5 +8,5 @@ class Tidy(GoalTask):
     """Put the relay into its box and the multimeter to the left of the screwdriver; see `GoalTask` for the reward."""
 
     scene = "tidy"
-    seconds = 60.0
+    seconds = 90.0
     goals = tuple(parse_goal(text) for text in ("relay in materialbox", "multimeter left-of screwdriver"))

@@ -1,6 +1,6 @@
 """From a detection's pose hypotheses to a registered candidate: depth alignment, registration, comparison of fits."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -52,6 +52,8 @@ class FitConfig:
     """So many of the starts are gone on with after the first casts."""
     promising: float = 0.4
     """... unless it has even less support than this: nothing like the model is there."""
+    hopeless: float = 0.02
+    """Starts of which none has more support than this after the first casts, with their wide gates, are given up."""
     retry_angle: float = np.deg2rad(14.0)
     """How far those starts are turned, radians."""
     align_reach: float = 0.3
@@ -96,7 +98,7 @@ class Prober:
         probe = replace(registration, schedule=schedule)
         self._fit = fit
         self._coarse = [replace(step, repeats=1, coarsen=2) for step in schedule[:5]]
-        self._refine = schedule[3:]
+        self._refine = [replace(step, repeats=min(step.repeats, 2)) for step in schedule[3:]]
         self._follow = registration.track_schedule
         self._narrow = [replace(step, repeats=2, coarsen=2) for step in registration.track_schedule]
         self._registration = Registration(probe)
@@ -106,6 +108,10 @@ class Prober:
     def close(self) -> None:
         """Release the scene's memory."""
         self._registration.close()
+
+    def count_casts(self, on_cast: Callable[[], None] | None) -> None:
+        """Have a function called before every cast from now on."""
+        self._registration.on_cast = on_cast
 
     def best(
         self,
@@ -143,6 +149,8 @@ class Prober:
             for schedule, first in ((self._coarse, 2), (self._narrow, 1))
             if (result := self._register(T, depth, intrinsics, schedule[:first])) is not None
         ]
+        if not any(result.support > self._fit.hopeless for result, _ in rough):
+            return None
         rough.sort(key=lambda entry: cost(entry[0]))
         finer = [
             self._register(result.T_camera_object, depth, intrinsics, rest)

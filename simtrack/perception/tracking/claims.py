@@ -1,7 +1,8 @@
 """Detections that need a registration of their own: of a new object, or of a known one that they see otherwise.
 
-Such a registration tries many starts and takes longer than a frame lasts. It is done beside the frames
-(`simtrack.perception.beside`); answers are taken up in the order of the claims.
+Such a registration tries many starts and takes longer than a frame lasts, some far longer than others. It is done
+beside the frames (`simtrack.perception.beside`), and taken to need as long as it has casts; answers are taken up in the
+order of the claims.
 """
 
 from collections import deque
@@ -12,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from simtrack.contracts import Float64, PoseHypothesis
-from simtrack.perception.beside import Beside, worker
+from simtrack.perception.beside import Paced, worker
 from simtrack.perception.tracking.birth import Occluders, Prober
 from simtrack.perception.tracking.follow_up import Candidate
 from simtrack.perception.tracking.registration import TrackedModel
@@ -53,12 +54,15 @@ class ClaimQueue:
         """`prober` belongs to the thread from now on."""
         self._prober, self._models, self._config = prober, models, config
         self._waiting: deque[Claim] = deque()
-        self._working: deque[tuple[Claim, Beside[Candidate | None]]] = deque()
+        self._working: deque[tuple[Claim, int, Paced[Candidate | None]]] = deque()
+        """Claims, stamps at which they were handed to the thread, and what it does about them."""
+        self._free = 0
+        """Stamp at which the thread is taken to have ended the claim that was settled last, nanoseconds."""
         self._thread = worker("claims")
 
     def add(self, claim: Claim) -> None:
         """Queue a claim. It takes the turn of an older one about the same thing, or is dropped if that is at work."""
-        if any(self._same(claim, other) for other, _ in self._working):
+        if any(self._same(claim, other) for other, _, _ in self._working):
             return
         for k, other in enumerate(self._waiting):
             if self._same(claim, other):
@@ -68,10 +72,15 @@ class ClaimQueue:
 
     def settle(self, stamp: int) -> tuple[Claim, Candidate | None] | None:
         """The first claim at work and what was found, once its time is up at `stamp`; waits if need be."""
-        if not self._working or not self._working[0][1].due(stamp):
+        if not self._working:
             return None
-        claim, beside = self._working.popleft()
-        return claim, beside.settle()
+        claim, begun, work = self._working[0]
+        end = work.end(max(begun, self._free), stamp)
+        if end is None:
+            return None
+        self._working.popleft()
+        self._free = end
+        return claim, work.settle()
 
     def work(self, stamp: int, oldest: int, views: Callable[[Claim], list[tuple[View, Occluders]]]) -> None:
         """Begin with the next claims, as far as there is room.
@@ -85,12 +94,16 @@ class ClaimQueue:
             claim = self._waiting.popleft()
             if claim.view.stamp < oldest or (claim.target is not None and not claim.target.alive):
                 continue
-            beside = Beside[Candidate | None](self._thread, self._config.claim_time)
-            beside.begin(stamp, partial(self._candidate, claim, views(claim)))
-            self._working.append((claim, beside))
+            work = Paced[Candidate | None](
+                self._thread, self._config.cast_time, partial(self._candidate, claim, views(claim))
+            )
+            self._working.append((claim, stamp, work))
 
-    def _candidate(self, claim: Claim, views: list[tuple[View, Occluders]]) -> Candidate | None:
+    def _candidate(
+        self, claim: Claim, views: list[tuple[View, Occluders]], step: Callable[[], None]
+    ) -> Candidate | None:
         """Register a claim to its own image, and follow what is found through the later ones."""
+        self._prober.count_casts(step)
         (view, around), later = views[0], views[1:]
         model = self._models[claim.class_name]
         fit = self._prober.best(claim.group, model, view.depth, view.intrinsics, around)

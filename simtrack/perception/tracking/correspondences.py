@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from simtrack.contracts import Float32, Float64, Int32
+from simtrack.contracts import Float32, Float64, Int32, Uint8
 
 MISS, SUPPORTED, OCCLUDED, MISSING, INVALID = 0, 1, 2, 3, 4
 """What a ray that hits a model says: nothing hit; measured there; something in front; seen through; no reading."""
@@ -144,6 +144,26 @@ def image_windows(corners, poses, camera, size, margin, windows):
 
 
 @njit(cache=True, nogil=True)
+def box_share_in_image(corners, pose, camera, size):
+    """Share of the bounding rectangle of a box's projected `corners` (8, 3) that lies inside the image, 0 to 1.
+
+    `pose` (4, 4) T_camera_object, `size` (width, height). 0 where the box reaches behind the camera.
+    """
+    u_low, v_low, u_high, v_high = np.inf, np.inf, -np.inf, -np.inf
+    for c in range(8):
+        p = corners[c]
+        z = pose[2, 0] * p[0] + pose[2, 1] * p[1] + pose[2, 2] * p[2] + pose[2, 3]
+        if z < 0.05:
+            return 0.0
+        u = camera[0] * (pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2] + pose[0, 3]) / z + camera[2]
+        v = camera[1] * (pose[1, 0] * p[0] + pose[1, 1] * p[1] + pose[1, 2] * p[2] + pose[1, 3]) / z + camera[3]
+        u_low, v_low, u_high, v_high = min(u_low, u), min(v_low, v), max(u_high, u), max(v_high, v)
+    inside_u = max(0.0, min(u_high, size[0] - 0.5) - max(u_low, -0.5))
+    inside_v = max(0.0, min(v_high, size[1] - 0.5) - max(v_low, -0.5))
+    return inside_u * inside_v / max((u_high - u_low) * (v_high - v_low), 1e-9)
+
+
+@njit(cache=True, nogil=True)
 def rows_of(instances, row, rows):
     """Rows (N,) of the instances that rays hit, by the table `row`; -1 = miss."""
     for i in range(instances.shape[0]):
@@ -167,41 +187,57 @@ def erase(pixels, images):
         instance[pixels[i]] = UNKNOWN_PIXEL
 
 
-@njit(cache=True, nogil=True)
-def mark_around(pixels, rows, strides, fine, marks):
-    """Mark the pixels that a finer cast may hit, and their neighbours, by what a coarser one hit.
+CELL = 4, 2
+"""Pixels that are marked together: columns and rows."""
 
-    `rows` (N,) as for `point_correspondences`; `strides` and `fine` (K,), the pixel grids of each instance in this cast
-    and in the finer one. Output: `marks` (H, W), True on the finer grid around each hit.
+
+def no_marks(height: int, width: int) -> Uint8:
+    """Marks of an image for `mark_around`: a cell holds a bit for each pixel grid (1, 2 or 4) that is wanted in it."""
+    return np.zeros((-(-height // CELL[1]), -(-width // CELL[0])), np.uint8)
+
+
+@njit(cache=True, nogil=True)
+def mark_around(pixels, rows, width, strides, fine, marks):
+    """Mark the cells that a finer cast may hit, and their neighbours, by what a coarser one hit.
+
+    `rows` (N,) as for `point_correspondences`; `width` of the image; `strides` and `fine` (K,), the pixel grids of each
+    instance in this cast and in the finer one. In and out: `marks`, see `no_marks`.
     """
-    height, width = marks.shape
+    across, down = CELL
     for i in range(pixels.shape[0]):
         k = rows[i]
         if k < 0 or k >= strides.shape[0]:
             continue
         v, u, f = pixels[i] // width, pixels[i] % width, fine[k]
         reach = strides[k] + 2 * f + 2  # up to the next ray that missed, the silhouette's surroundings, a motion
-        low = (max(u - reach, 0) + f - 1) // f * f
-        for y in range((max(v - reach, 0) + f - 1) // f * f, min(v + reach + 1, height), f):
-            for x in range(low, min(u + reach + 1, width), f):
-                marks[y, x] = True
+        for y in range(max(v - reach, 0) // down, min((v + reach) // down + 1, marks.shape[0])):
+            for x in range(max(u - reach, 0) // across, min((u + reach) // across + 1, marks.shape[1])):
+                marks[y, x] |= f
 
 
 @njit(cache=True, nogil=True)
-def take_marked(marks):
-    """Flat indices of the marked pixels, ascending; nothing is marked afterwards."""
-    flat = marks.reshape(-1)
+def take_marked(marks, height, width):
+    """Flat indices of the pixels of an image that are marked, ascending; nothing is marked afterwards."""
+    across, down = CELL
     count = 0
-    for i in range(flat.shape[0]):
-        count += flat[i]
-    pixels = np.empty(count, np.int32)
+    for y in range(marks.shape[0]):
+        for x in range(marks.shape[1]):
+            count += marks[y, x] != 0
+    pixels = np.empty(count * across * down, np.int32)
     found = 0
-    for i in range(flat.shape[0]):
-        if flat[i]:
-            pixels[found] = i
-            found += 1
-            flat[i] = False
-    return pixels
+    for v in range(height):
+        row = marks[v // down]
+        for x in range(row.shape[0]):
+            if row[x] == 0:
+                continue
+            grid = 1 if row[x] & 1 else (2 if row[x] & 2 else 4)
+            if v % grid == 0:
+                for u in range(x * across, min((x + 1) * across, width), grid):
+                    pixels[found] = v * width + u
+                    found += 1
+            if v % down == down - 1 or v == height - 1:
+                row[x] = 0
+    return pixels[:found].copy()
 
 
 @njit(cache=True, nogil=True)

@@ -131,7 +131,7 @@ class PoseFilter:
         """(4, 4) pose at a stamp within the memory, or predicted to a later one."""
         for state, _ in reversed(self._past):
             if state.stamp <= stamp:
-                return self._predicted(state, stamp).T_map_object
+                return self._moved(state, stamp)[0]
         return self._past[0][0].T_map_object
 
     def starts_to_move(self, measurement: Measurement) -> bool:
@@ -145,9 +145,14 @@ class PoseFilter:
         return bool(kernels.surprise(*arguments) > self.config.start_threshold)
 
     def _predicted(self, state: FilterState, stamp: int) -> FilterState:
+        if stamp <= state.stamp:
+            return state
+        T, P = self._moved(state, stamp)
+        return FilterState(stamp, T, state.velocity, P, state.moving, state.slow_since)
+
+    def _moved(self, state: FilterState, stamp: int) -> tuple[Float64, Float64]:
         dt = (stamp - state.stamp) / NANOSECONDS
-        T, P = kernels.predict(state.T_map_object, state.velocity, state.covariance, state.moving, dt, self._rules)
-        return replace(state, stamp=max(stamp, state.stamp), T_map_object=T, covariance=P)
+        return kernels.predict(state.T_map_object, state.velocity, state.covariance, state.moving, dt, self._rules)
 
     def _fuse(self, m: Measurement) -> None:
         before, dt = self.state, (m.stamp - self.state.stamp) / NANOSECONDS

@@ -13,7 +13,10 @@ _RUN = 64
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _linearise(points, first, count, R, centre, shift, scale, terms):
-    """Rows of `terms`, a column a pair: the six derivatives, residual, weight, its robust share, squared deviations."""
+    """Rows of `terms`, a column a pair.
+
+    The six derivatives, the residual, its weight, the robust share of that, squared deviations, the kernel's curvature.
+    """
     last = first + count  # slices, because indices that could be negative keep the loop from being vectorised
     measured, model, normal, weight = (
         points[0][first:last],
@@ -39,12 +42,13 @@ def _linearise(points, first, count, R, centre, shift, scale, terms):
         terms[0, i], terms[1, i], terms[2, i] = nx, ny, nz
         terms[3, i], terms[4, i], terms[5, i] = by * nz - bz * ny, bz * nx - bx * nz, bx * ny - by * nx
         terms[6, i], terms[7, i], terms[8, i], terms[9, i] = r, weight[i] * root * root, root * root, squared
+        terms[10, i] = root * root * (1.0 - 4.0 * squared / (scale + squared))
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nsz", "reassoc"})
 def _add_up(terms, count, H, g, stats):
-    """Add the sums over the columns of `terms` to `H` (6, 6), `g` (6,) and `stats` (3,) of one instance."""
-    weighted = terms[10]
+    """Add the sums over the columns of `terms` to `H` (6, 6), `g` (6,) and `stats` (4,) of one instance."""
+    weighted = terms[11]
     for a in range(6):
         for i in range(count):
             weighted[i] = terms[7, i] * terms[a, i]
@@ -57,33 +61,36 @@ def _add_up(terms, count, H, g, stats):
             for i in range(count):
                 total += weighted[i] * terms[b, i]
             H[a, b] += total
-    share, squared, deviation = 0.0, 0.0, 0.0
+    share, squared, deviation, curvature = 0.0, 0.0, 0.0, 0.0
     for i in range(count):
         share += terms[8, i]
+        curvature += terms[10, i]
         squared += terms[8, i] * terms[9, i]
         deviation += terms[8, i] * terms[6, i] * terms[6, i]
     stats[0] += share
     stats[1] += squared
     stats[2] += deviation
+    stats[3] += curvature
 
 
 @njit(cache=True, nogil=True)
-def point_normal_equations(points, count, centres, rotations, shifts, kernel, H, g, stats):
-    """Accumulate robust point-to-plane normal equations of every instance from the first `count` pairs.
+def point_normal_equations(points, count, wanted, centres, rotations, shifts, kernel, H, g, stats):
+    """Accumulate robust point-to-plane normal equations of the `wanted` (K,) instances from the first `count` pairs.
 
     The models have moved since the cast by ``m' = c + R (m - c) + t`` about their `centres` (K, 3); `rotations` (K, 3,
     3), `shifts` (K, 3). Residual ``r = n . (p - m')``, Geman-McClure weights, scale `kernel` in standard deviations.
-    Outputs: `H` (K, 6, 6) and `g` (K, 6) with ``H xi = g``; `stats` (K, 3): weighted pairs, sum of w r^2 in units of
-    the variance, sum of squared residuals of inliers in m^2.
+    Outputs: `H` (K, 6, 6) and `g` (K, 6) with ``H xi = g``; `stats` (K, 4): weighted pairs, sum of w r^2 in units of
+    the variance, sum of squared residuals of inliers in m^2, sum of the kernel's curvatures.
     """
-    owner, terms = points[4], np.empty((11, _RUN))
+    owner, terms = points[4], np.empty((12, _RUN))
     first = 0
     while first < count:
         k, last = owner[first], first + 1
         while last < min(first + _RUN, count) and owner[last] == k:
             last += 1
-        _linearise(points, first, last - first, rotations[k], centres[k], shifts[k], kernel * kernel, terms)
-        _add_up(terms, last - first, H[k], g[k], stats[k])
+        if wanted[k]:
+            _linearise(points, first, last - first, rotations[k], centres[k], shifts[k], kernel * kernel, terms)
+            _add_up(terms, last - first, H[k], g[k], stats[k])
         first = last
 
 

@@ -6,7 +6,7 @@ or by the paper's Umeyama fits. Directions that the data do not constrain are fo
 moved.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,9 +78,11 @@ class Registration:
         self._scene = RayScene()
         self._models: dict[int, TrackedModel] = {}
         self._images = kernels.ModelImages.empty(0, 0)
-        self._marks = np.zeros((0, 0), bool)
-        """(H, W), where the casts of a track have hit something, or nearly: a fine one needs no other rays."""
+        self._marks = kernels.no_marks(0, 0)
+        """Where the casts of a track have hit something, or nearly: a fine one needs no other rays."""
         self._points, self._edges = kernels.Points.room(0), kernels.Edges.room(0)
+        self.on_cast: Callable[[], None] | None = None
+        """Called before every cast."""
 
     def add(self, instance: int, model: TrackedModel) -> None:
         """Put an instance of a model into the scene."""
@@ -133,7 +135,7 @@ class Registration:
         if batch is None:
             return {}
         predicted = batch.poses.copy()
-        self._marks[:] = False
+        self._marks[:] = 0
         self._follow(batch, (config.near,), np.ones(len(batch.instances), bool))
         far = ~batch.near(predicted, config)
         if far.any():
@@ -216,14 +218,16 @@ class Registration:
         self._scene.set_poses(list(shown), list(shown.values()))
         if self._images.depth.shape != depth.shape:
             self._images = kernels.ModelImages.empty(*depth.shape)
-            self._marks = np.zeros(depth.shape, bool)
+            self._marks = kernels.no_marks(*depth.shape)
         return batch if batch.instances else None
 
     def _cast(self, batch: "_Batch", strides: npt.NDArray[np.int64], marked: bool = False) -> tuple[RayBundle, RayHits]:
         """Cast the rays of the active instances' windows, on pixel grids (K,), or those that are marked."""
+        if self.on_cast is not None:
+            self.on_cast()
         windows, grids = batch.windows[batch.active], strides[batch.active]
         if marked:
-            bundle = RayBundle.from_pixels(batch.intrinsics, kernels.take_marked(self._marks))
+            bundle = RayBundle.from_pixels(batch.intrinsics, kernels.take_marked(self._marks, *batch.depth.shape))
         else:
             bundle = RayBundle.from_windows(batch.intrinsics, windows.tolist(), grids.tolist())
         # Rays a few pixels apart meet other triangles of a fine mesh: they are no coherent packets.
@@ -246,7 +250,7 @@ class Registration:
         rows = np.empty(len(bundle), np.int32)
         kernels.rows_of(hits.instances, row, rows)
         if not step.fine:
-            kernels.mark_around(pixels, rows, strides, batch.fine_strides, self._marks)
+            kernels.mark_around(pixels, rows, batch.depth.shape[1], strides, batch.fine_strides, self._marks)
         batch.counts[batch.active], batch.edges[batch.active] = 0, 0
         pairs = kernels.point_correspondences(
             pixels, bundle.directions, hits.distances, hits.normals, rows, batch.depth.reshape(-1),
@@ -344,7 +348,7 @@ class _Batch:
         shares = np.array([[config.correlation_area / s**2, config.edge_correlation / s] for s in strides])
         settings = solver.SolverSettings(
             step.kernel, config.edge_kernel, _EDGES[step.silhouettes], config.edge_sigma, config.unconstrained_sigma,
-            config.max_shift, config.max_turn,
+            config.max_shift, config.max_turn, config.last_step,
         )  # fmt: skip
         solver.gauss_newton(
             points, pairs, edges, edge_pairs, self.camera, centres, rotations, shifts, self._radii,

@@ -26,8 +26,8 @@ class Step:
     fine: bool = False
     """Every pixel instead, of models whose windows are not too large: see `RegistrationConfig.max_fine_rays`."""
     silhouettes: Literal["always", "where-open", "never"] = "where-open"
-    """Silhouettes widen the basin of convergence; they are coarse, so that in the end they only speak in directions
-    that the faces leave open."""
+    """Silhouettes widen the basin of convergence. On a coarse grid they are coarse, so that in the end they only speak
+    in directions that the faces leave open; on every pixel they tell about as much as the faces."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +51,9 @@ class RegistrationConfig:
         Step(gate=0.006, kernel=3.0, edge_reach=5, repeats=2),
     )
     """Outer iterations from a prediction, as of a track."""
-    near: Step = field(default=Step(gate=0.008, kernel=4.0, edge_reach=5, repeats=2, silhouettes="always"))
+    near: Step = field(default=Step(gate=0.008, kernel=4.0, edge_reach=5, silhouettes="always"))
     """What a track is tried with first: most predictions are so good that wide gates would only lead away from them."""
-    finish: Step | None = field(default=Step(gate=0.006, kernel=3.0, edge_reach=5, fine=True))
+    finish: Step | None = field(default=Step(gate=0.006, kernel=3.0, edge_reach=5, fine=True, silhouettes="always"))
     """How a track ends, near or not: a single cast at full resolution, from a pose that leaves little to be moved."""
     near_support: float = 0.9
     """It is enough for an instance that it leaves with no less support than this, ..."""
@@ -63,6 +63,8 @@ class RegistrationConfig:
     """... and not further than this from the prediction, metres of surface."""
     inner_iterations: int = 3
     """Solver steps on the same correspondences (the paper: 10 Umeyama fits)."""
+    last_step: float = 1e-5
+    """... of which one that is shorter than this is the last, metres of surface."""
     tolerance: float = 5e-5
     """An instance that an outer iteration moves by less than this has converged, metres of surface, ..."""
     insignificant: float = 0.3
@@ -96,7 +98,7 @@ class RegistrationConfig:
     max_rays: int = 2500
     """Coarser pixel grids are used for models whose image window holds more pixels than this."""
 
-    max_fine_rays: int = 20_000
+    max_fine_rays: int = 40_000
     """As `max_rays`, of fine steps."""
 
     def __post_init__(self) -> None:

@@ -19,6 +19,10 @@ EDGES_NEVER, EDGES_WHERE_OPEN, EDGES_ALWAYS = 0, 1, 2
 """When silhouettes take part."""
 
 
+MAX_LENGTHENING = 1.6
+"""Robust steps are lengthened at most this much."""
+
+
 class SolverSettings(NamedTuple):
     """What `gauss_newton` needs to know."""
 
@@ -36,6 +40,8 @@ class SolverSettings(NamedTuple):
     """Longest step, metres."""
     max_turn: float
     """Largest step, radians."""
+    last_step: float
+    """An instance whose step is shorter than this, metres of surface, takes it and no other."""
 
 
 @njit(cache=True, nogil=True)
@@ -140,28 +146,31 @@ def gauss_newton(
     points, pairs, edges, edge_pairs, camera, centres, rotations, shifts, radii, correlation, active, settings,
     iterations, covariance, constrained, stats,
 ):  # fmt: skip
-    """Move every active instance by `iterations` steps (0: only judge), then leave what is known at the last pose.
+    """Move every active instance by up to `iterations` steps (0: only judge), and leave what is known in the end.
 
     The first `pairs` of `points` and `edge_pairs` of `edges` count; `camera` (4,) is fx, fy, cx, cy; `centres` (K, 3)
     are the objects' origins at the time of the cast. In and out: `rotations` (K, 3, 3) and `shifts` (K, 3), the motion
     since the cast about the centres. `radii` (K,), metres; `correlation` (K, 2): readings, and silhouette pixels, that
     count as one; `active` (K,). Out, of active instances: `covariance` (K, 6, 6), `constrained` (K,) number of
-    constrained directions, `stats` (K, 3) of `point_normal_equations`.
+    constrained directions, `stats` (K, 3), the first of `point_normal_equations`.
     """
     K = centres.shape[0]
     H, H_edge = np.empty((K, 6, 6)), np.empty((K, 6, 6))
     g, g_edge = np.empty((K, 6)), np.empty((K, 6))
-    sums = np.empty((K, 3))
+    sums = np.empty((K, 4))
     scale = np.ones(6)
+    open_ = active.copy()
     for step in range(iterations + 1):
+        if not open_.any():
+            break
         H[:], H_edge[:], g[:], g_edge[:], sums[:] = 0.0, 0.0, 0.0, 0.0, 0.0
-        point_normal_equations(points, pairs, centres, rotations, shifts, settings.kernel, H, g, sums)
+        point_normal_equations(points, pairs, open_, centres, rotations, shifts, settings.kernel, H, g, sums)
         if settings.edges != EDGES_NEVER:
             edge_normal_equations(
                 edges, edge_pairs, camera, centres, rotations, shifts, settings.edge_kernel, H_edge, g_edge
             )
         for k in range(K):
-            if not active[k]:
+            if not open_[k]:
                 continue
             scale[3:] = 1.0 / radii[k]
             outer = scale.reshape(6, 1) * scale
@@ -173,8 +182,13 @@ def gauss_newton(
                 g_edge[k] * scale * edge_share, settings.edges, settings.edge_sigma,
             )  # fmt: skip
             xi, P, known = constrained_solution(A, b, settings.unconstrained_sigma)
+            # Weights that stand still during a step make it too short, by the kernel's curvature to them.
+            xi *= min(max(sums[k, 0] / max(sums[k, 3], 1e-9), 1.0), MAX_LENGTHENING)
+            surface = np.sqrt((xi[:3] ** 2).sum()) + np.sqrt((xi[3:] ** 2).sum())
+            if step == iterations or surface < settings.last_step:
+                covariance[k], constrained[k], stats[k] = P * outer, known, sums[k, :3]
+                open_[k] = False
             if step == iterations:
-                covariance[k], constrained[k], stats[k] = P * outer, known, sums[k]
                 continue
             xi *= scale
             length = np.sqrt(xi[0] ** 2 + xi[1] ** 2 + xi[2] ** 2)

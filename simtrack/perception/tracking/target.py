@@ -5,9 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Float32, Float64, TrackStatus
-from simtrack.geometry.transforms import skew
+from simtrack.geometry.transforms import with_lever
 from simtrack.objects import ObjectModel
 from simtrack.perception.tracking.birth import FitConfig
+from simtrack.perception.tracking.correspondences import box_share_in_image
 from simtrack.perception.tracking.filter import FilterConfig, PoseFilter
 from simtrack.perception.tracking.registration import RegistrationConfig, RegistrationResult, TrackedModel
 from simtrack.raycast import TriangleMesh
@@ -22,9 +23,9 @@ class TrackerConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     buffer: float = 0.8
     """Depth images are kept this long for late detections, seconds."""
-    claim_time: float = 0.03
-    """A detection of something new, or that contradicts a track, is registered beside the frames for this long,
-    seconds of the sensor's clock."""
+    cast_time: float = 0.00075
+    """A detection of something new, or that contradicts a track, is registered beside the frames; each of the casts
+    that this needs is taken to last so long, seconds of the sensor's clock."""
     confirm_detections: int = 2
     """Detections that a new object needs before it is believed; one is enough where the fit leaves no doubt."""
     confirm_frames: int = 3
@@ -146,19 +147,11 @@ def beside(T_a: Float64, T_b: Float64) -> float:
 
 def camera_error_at(view: View, T_map_object: Float64) -> Float64:
     """(6, 6) covariance that an uncertain camera pose adds to an object's pose in the map, lever arm included."""
-    J = np.eye(6)
-    J[:3, 3:] = -skew(T_map_object[:3, 3] - view.T_map_camera[:3, 3])
-    return J @ view.covariance @ J.T
+    return with_lever(view.covariance, T_map_object[:3, 3] - view.T_map_camera[:3, 3])
 
 
 def share_in_image(model: ObjectModel, T_camera_object: Float64, intrinsics: CameraIntrinsics) -> float:
     """Share of the projected box's bounding rectangle that lies inside the image."""
-    p = model.keypoints[:8] @ T_camera_object[:3, :3].T + T_camera_object[:3, 3]
-    if p[:, 2].min() < 0.05:
-        return 0.0
-    u = intrinsics.fx * p[:, 0] / p[:, 2] + intrinsics.cx
-    v = intrinsics.fy * p[:, 1] / p[:, 2] + intrinsics.cy
-    width, height = float(np.ptp(u)), float(np.ptp(v))
-    inside_u = max(0.0, min(float(u.max()), intrinsics.width - 0.5) - max(float(u.min()), -0.5))
-    inside_v = max(0.0, min(float(v.max()), intrinsics.height - 0.5) - max(float(v.min()), -0.5))
-    return inside_u * inside_v / max(width * height, 1e-9)
+    camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
+    size = (intrinsics.width, intrinsics.height)
+    return box_share_in_image(model.keypoints[:8], T_camera_object, camera, size)

@@ -179,13 +179,16 @@ class ObjectTracker:
         target.residual = result.residual
         target.moved_when_seen = target.filter.state.moving
         target.score = min(0.99, target.score + 0.05)
-        # A fit that leaves no doubt needs no second detection to be believed.
-        clear = not target.doubtful(self.config) and not target.vague(self.config)
-        told = target.detections >= (1 if clear else self.config.confirm_detections)
-        fits = result.misfit <= self.config.fit.misfit
-        enough = told and fits and target.frames >= self.config.confirm_frames
-        if enough or target.status is not TrackStatus.TENTATIVE:
+        if target.status is not TrackStatus.TENTATIVE or self._proven(target, result):
             target.status, target.known = TrackStatus.CONFIRMED, True
+
+    def _proven(self, target: Target, result: RegistrationResult) -> bool:
+        """Whether enough has been seen of a new object to believe in it."""
+        if result.misfit > self.config.fit.misfit or target.frames < self.config.confirm_frames:
+            return False
+        # A fit that leaves no doubt needs no second detection.
+        clear = not target.doubtful(self.config) and not target.vague(self.config)
+        return target.detections >= (1 if clear else self.config.confirm_detections)
 
     def _incredible(self, target: Target, m: Measurement) -> bool:
         """Whether a registration tells of a motion that is too fast for hands, or that it cannot tell of.

@@ -2,7 +2,7 @@ import numpy as np
 
 from simtrack.geometry.transforms import exp_so3, perturb
 from simtrack.perception.tracking import solver
-from simtrack.perception.tracking.correspondences import Edges, Points
+from simtrack.perception.tracking.correspondences import Edges, Points, mark_around, no_marks, take_marked
 from simtrack.perception.tracking.normal_equations import edge_normal_equations, point_normal_equations
 
 CAMERA = np.array([577.0, 577.0, 319.5, 239.5])
@@ -31,10 +31,12 @@ def test_point_gradient_is_that_of_the_cost() -> None:
     rng = np.random.default_rng(1)
     measured, model, normal = _points(rng)
     centre = np.array([0.01, -0.02, 1.0])
-    H, g, stats = np.zeros((1, 6, 6)), np.zeros((1, 6)), np.zeros((1, 3))
+    H, g, stats = np.zeros((1, 6, 6)), np.zeros((1, 6)), np.zeros((1, 4))
     n = len(model)
     points = Points(measured, model, normal, np.full(n, 1e4), np.zeros(n, np.int32))
-    point_normal_equations(points, n, centre[None], np.eye(3)[None], np.zeros((1, 3)), 1e6, H, g, stats)
+    point_normal_equations(
+        points, n, np.ones(1, bool), centre[None], np.eye(3)[None], np.zeros((1, 3)), 1e6, H, g, stats
+    )
     step = 1e-6
     for i in range(6):
         xi = np.zeros(6)
@@ -127,3 +129,54 @@ def test_poses_stay_rigid_over_many_motions() -> None:
         assert abs(deviations[0] - 2.0 * np.linalg.norm(phi)) < 1e-3
     np.testing.assert_allclose(poses[0, :3, :3] @ poses[0, :3, :3].T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(poses[0, :3, :3], expected, atol=1e-11)
+
+
+def _moved_by_gauss_newton(points: Points, centre: np.ndarray, steps: int, last_step: float) -> tuple[np.ndarray, ...]:
+    settings = solver.SolverSettings(3.0, 3.0, solver.EDGES_NEVER, 0.0015, 0.01, 0.01, 0.1, last_step)
+    rotations, shifts = np.eye(3)[None].copy(), np.zeros((1, 3))
+    covariance, constrained, stats = np.zeros((1, 6, 6)), np.zeros(1, np.int64), np.zeros((1, 3))
+    solver.gauss_newton(
+        points, len(points.weight), Edges.room(0), 0, CAMERA, centre[None], rotations, shifts, np.array([0.1]),
+        np.ones((1, 2)), np.ones(1, bool), settings, steps, covariance, constrained, stats,
+    )  # fmt: skip
+    return rotations[0], shifts[0], covariance[0]
+
+
+def test_a_few_robust_steps_are_enough_under_noise() -> None:
+    rng = np.random.default_rng(4)
+    _, model, normal = _points(rng, 400)
+    centre, sigma = np.array([0.0, 0.0, 1.0]), 0.001
+    xi = np.array([0.001, -0.0005, 0.001, 0.01, -0.005, 0.005])
+    measured = centre + (model - centre) @ exp_so3(xi[3:]).T + xi[:3] + sigma * rng.standard_normal((400, 3))
+    points = Points(measured, model, normal, np.full(400, sigma**-2), np.zeros(400, np.int32))
+    R_end, t_end, P_end = _moved_by_gauss_newton(points, centre, 40, 0.0)
+    R, t, _ = _moved_by_gauss_newton(points, centre, 3, 0.0)
+    assert np.linalg.norm(t - t_end) < 2e-6  # of 1.5 mm; with the weights' own step length it is ten times as much
+    assert np.linalg.norm(R - R_end) < 5e-5
+
+    R, t, P = _moved_by_gauss_newton(points, centre, 40, 1e-5)  # ends by itself, and knows as much
+    assert np.linalg.norm(t - t_end) < 1e-6
+    np.testing.assert_allclose(np.diag(P), np.diag(P_end), rtol=0.01)
+
+
+def test_what_is_marked_is_taken_once_in_order() -> None:
+    height, width = 31, 50  # no multiples of the cells' size
+    marks = no_marks(height, width)
+    pixels, rows = np.array([7 * width + 12, 30 * width + 48, 20 * width + 4], np.int32), np.array([0, 1, 2], np.int32)
+    strides, fine = np.array([2, 4, 4]), np.array([1, 2, 4])
+    mark_around(pixels, rows, width, strides, fine, marks)
+    taken = take_marked(marks, height, width)
+    assert np.all(np.diff(taken) > 0)
+    assert taken[-1] < height * width
+    v, u = np.divmod(taken, width)
+    for pixel, row in zip(pixels, rows, strict=True):
+        f, reach = int(fine[row]), int(strides[row] + 2 * fine[row] + 2)
+        wanted = {
+            (y, x)
+            for y in range(height)
+            for x in range(width)
+            if abs(y - pixel // width) <= reach and abs(x - pixel % width) <= reach and y % f == 0 and x % f == 0
+        }
+        assert wanted <= set(zip(v.tolist(), u.tolist(), strict=True))
+    assert len(taken) < 0.5 * height * width
+    assert len(take_marked(marks, height, width)) == 0
