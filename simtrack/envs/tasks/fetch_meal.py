@@ -60,6 +60,7 @@ class FetchMeal(Task):
     and two for the microwave closed with the item inside, which ends the episode as a success.
     """
 
+    script = "fetch-meal"
     scene = "kitchen:0"
     seconds = 240.0
     macros = ("articulate", "take", "insert")
