@@ -62,11 +62,12 @@ def env(
     columns = []
     for number, name in enumerate(scene or (None,)):
         chosen = arguments if name is None else {**arguments, "scene": name}
-        files = [_numbered(path, number if len(scene) > 1 else None) for path in (json_file, video, record)]
+        own = number if len(scene) > 1 else None
+        kept, film, log = (_numbered(path, own) for path in (json_file, video, record))
         if len(scene) > 1:
             print(f"{name}:", flush=True)
         seeds = range(seed, seed + episodes)
-        columns.append(_played(full_id(env_id), policy, feed, seeds, chosen, *files, record_as))
+        columns.append(_played(full_id(env_id), policy, feed, seeds, chosen, kept, film, log, record_as))
     rows = [("success", *(f"{sum(r.success for r in results)}/{episodes}" for results in columns))]
     rows += [("return", *(f"{sum(r.total for r in results) / episodes:.3f}" for results in columns))]
     for name in columns[0][0].metrics:

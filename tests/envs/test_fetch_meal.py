@@ -11,7 +11,6 @@ from gymnasium.utils.env_checker import check_env
 from simtrack.contracts import Float64
 from simtrack.envs.actions import Outcome, Request
 from simtrack.envs.environment import SimtrackEnv
-from simtrack.envs.observations import OUTCOMES
 from simtrack.envs.wrappers import simtrack_env
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import apply, inverse
@@ -82,11 +81,11 @@ def stand(env: SimtrackEnv, x: float, y: float) -> None:
 
 def ask(env: SimtrackEnv, request: Request) -> tuple[Outcome, float]:
     """Until the arm is done; how it fared, and the rewards meanwhile."""
-    observation, reward, *_ = env.step(request.action(env.task.macros))
-    while OUTCOMES[int(np.argmax(observation["macro"]))] is Outcome.BUSY:
-        observation, more, *_ = env.step(np.zeros(env.action_space.shape or (0,), np.float32))
-        reward += more
-    return OUTCOMES[int(np.argmax(observation["macro"]))], reward
+    _, reward, *_ = env.step(request.action(env.task.macros))
+    while env.snapshot is not None and env.snapshot.felt.macro is Outcome.BUSY:
+        reward += env.step(np.zeros(env.action_space.shape or (0,), np.float32))[1]
+    assert env.snapshot is not None
+    return env.snapshot.felt.macro, reward
 
 
 def in_base(env: SimtrackEnv, place: Float64) -> Float64:

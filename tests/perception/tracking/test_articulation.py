@@ -18,6 +18,7 @@ from simtrack.perception.tracking.articulation import (
 )
 from simtrack.perception.tracking.correspondences import Points
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
+from simtrack.recordings import archive
 
 CAMERA = CameraIntrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
 T_MAP_CAMERA = look_at(np.array([-1.5, -0.7, 1.5]), np.array([0.0, 0.0, 0.85]))
@@ -168,3 +169,12 @@ def test_fit_leaves_the_belief_as_it_is() -> None:
     found = tracker.fit(0, image((0.0, 0.2), rng), CAMERA, T_MAP_CAMERA, 0.17)
     assert abs(found.position - 0.2) < 0.005 and found.support > 0.9 and tracker.estimates(0) == before
     tracker.close()
+
+
+def test_maps_with_joints_survive_a_recording() -> None:
+    read = archive.decode(StaticMap, archive.encode(MAP))
+    for one, other in zip(read.articulations, MAP.articulations, strict=True):
+        assert (one.name, one.kind, one.lower, one.upper) == (other.name, other.kind, other.lower, other.upper)
+        np.testing.assert_array_equal(one.vertices, other.vertices)
+    with pytest.raises(archive.ArchiveError, match="expected one of 'revolute', 'prismatic'"):
+        archive.decode(StaticMap, archive.encode(replace(MAP, articulations=(replace(DOOR, kind="ball"),))))
