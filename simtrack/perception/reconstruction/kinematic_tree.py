@@ -17,7 +17,7 @@ from simtrack.objects.cad.model import CadJoint, CadPart
 from simtrack.perception.reconstruction.body_tree import Body, BodyJoint, BodyTree, JointKind, Shape
 from simtrack.perception.reconstruction.candidates import CadCandidate
 from simtrack.perception.reconstruction.layout import layout_mesh, layout_slabs
-from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_far_above, is_layout
 from simtrack.perception.scene_graph.contact.nodes import SCENE
 
 FIXED_CLASSES = frozenset(
@@ -99,6 +99,8 @@ def is_free(graph: ContactGraph, entity: str, candidate: CadCandidate, *, ground
     """
     support = graph.supports[entity]
     if support.kind is SupportKind.HUNG or (support.kind is SupportKind.ROOT and not grounded):
+        return False
+    if is_far_above(graph.nodes[entity], support):
         return False
     return graph.nodes[entity].semantic_class not in FIXED_CLASSES and scaled_mass(candidate) <= LIFTABLE
 
