@@ -12,12 +12,14 @@ from simtrack.objects.tiago import HEAD_PAN, HEAD_TILT, TORSO, tiago
 AXES: dict[str, float] = {"linear": 0.9, "angular": 1.0, "pan": 2.0, "tilt": 2.0, "torso": 0.07}
 """Axis of an action -> its speed at 1: m/s forward, rad/s to the left, rad/s of the head to the left and up, m/s up."""
 
-MACROS = ("grasp", "place")
-"""What an arm can be asked for. Each that a task knows has an axis; the largest that is above `TRIGGER` begins."""
+MACROS = ("grasp", "place", "articulate", "take", "insert")
+"""What an arm can be asked for: to grasp from above and place, to open and close doors and drawers, to take from the
+front and insert. Each that a task knows has an axis; the largest that is above `TRIGGER` begins."""
 WHERE: dict[str, tuple[float, float]] = {
     "x": (0.2, 1.2), "y": (-0.7, 0.7), "z": (0.2, 1.4), "heading": (-np.pi, np.pi),
 }  # fmt: skip
-"""Axis -> what -1 and 1 stand for: a place in the base frame, metres, and a heading about the vertical, radians."""
+"""Axis -> what -1 and 1 stand for: a place in the base frame, metres, and a heading about the vertical, radians (where
+something is articulated: its joint's position, radians or metres)."""
 TRIGGER = 0.5
 
 
@@ -38,6 +40,8 @@ class Outcome(StrEnum):
     """The cup holds something already."""
     EMPTY = "empty"
     """There is nothing in the cup to be placed."""
+    SLIPPED = "slipped"
+    """What was held came off on the way."""
 
 
 MOVES: dict[str, dict[str, float]] = {
@@ -73,9 +77,11 @@ class Request:
     macro: str
     """One of `MACROS`."""
     position: Float64
-    """(3,), base frame, metres: of the believed object that shall be grasped, or where its origin shall be put."""
+    """(3,), base frame, metres: of the believed object that shall be grasped, or where its origin shall be put; near
+    the door that shall move."""
     heading: float = 0.0
-    """Radians, base frame: that which an object shall have where it is put."""
+    """Radians, base frame: that which an object shall have where it is put. Of a door or drawer: the position that its
+    joint shall have, radians or metres."""
 
     def action(self, macros: Sequence[str]) -> Float32:
         """(A,) the action that asks for it, of a task with these macros; what is out of range is cut off."""

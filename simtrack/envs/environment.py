@@ -13,6 +13,7 @@ from simtrack.envs.policies import Briefing
 from simtrack.envs.settings import (
     CONTROL_HZ,
     Settings,
+    articulations_of,
     classes_of,
     fixed_building,
     furniture_of,
@@ -85,7 +86,7 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         seconds = self.settings.seconds or self.task.seconds
         self.layout = Layout(
             classes_of(self.scene), self.settings.slots, furniture_of(self.scene), seconds, camera.intrinsics,
-            camera.max_range, self.task.macros,
+            camera.max_range, self.task.macros, articulations_of(self.scene),
         )  # fmt: skip
         spaces = {mode: self.layout.space(mode) for mode in self.settings.modes}
         self.observation_space = (

@@ -119,8 +119,10 @@ class Loop:
         simulation = self.simulation
         if self.manipulator is not None:
             if request is not None and not self.manipulator.busy and self._belief is not None:
-                begin(self.manipulator, request, self._belief, simulation.models)
-            self.manipulator.step()
+                begin(self.manipulator, request, self._belief, simulation.models, simulation.static_map)
+            self.manipulator.step(None if self._belief is None else self._belief.localization.T_map_base)
+            if self.manipulator.busy:
+                command = replace(command, linear=self.manipulator.drive, angular=0.0)
         self._feed.clear()
         for frame in simulation.advance(command, want_rgb=self.colours):
             self._feed.append(frame)

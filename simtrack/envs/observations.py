@@ -15,6 +15,7 @@ from simtrack.contracts import (
     NANOSECONDS,
     Belief,
     CameraIntrinsics,
+    JointEstimate,
     JointState,
     Localization,
     Presegmentation,
@@ -50,6 +51,8 @@ AGE = 600.0
 """Seconds: bound of ages."""
 VARIANCE = 100.0
 """m^2 or rad^2: bound of the elements of covariances."""
+OPEN = 7.0
+"""Radians or metres: bound of the positions of doors and drawers."""
 REGIONS = 12
 """Regions of unexplained measurements that are reported at most, the largest first."""
 STATUSES = tuple(TrackStatus)
@@ -81,6 +84,8 @@ class Layout:
     """Metres: the largest depth that the camera reads."""
     macros: tuple[str, ...] = ()
     """What the arm can be asked for."""
+    articulations: tuple[str, ...] = ()
+    """Names of the map's doors and drawers."""
 
     def space(self, mode: str) -> spaces.Dict:
         """The space of one mode; finite bounds, metres, radians, row 0 on top."""
@@ -111,6 +116,12 @@ class Layout:
             "base_deviation": _box((3,), 0.0, np.sqrt(VARIANCE)),
             "localization": _box((len(ANSWERS) + 1,), 0, 1, np.int8),
         }
+        if self.articulations:
+            count = (len(self.articulations),)
+            entries["articulation_position"] = _box(count, -OPEN, OPEN)
+            entries["articulation_deviation"] = _box(count, 0.0, OPEN)
+            entries["articulation_age"] = _box(count, 0.0, AGE)
+            entries["articulation_seen"] = _box(count, 0, 1, np.int8)
         return spaces.Dict({**entries, **self._robot()})
 
     def _robot(self) -> dict[str, spaces.Space]:
@@ -169,6 +180,7 @@ class Encoder:
         for slot, track in kept:
             self._write(out, slot, track, belief.stamp)
         self._relate(out, belief, kept)
+        self._articulate(out, belief)
         self._look(out, belief)
         where = belief.localization
         x, y = where.T_map_base[:2, 3]
@@ -212,6 +224,18 @@ class Encoder:
             if relation.subject in rows and relation.reference in columns:
                 at = rows[relation.subject], columns[relation.reference], self._relation[relation.name]
                 out["relations"][at] = 1
+
+    def _articulate(self, out: Arrays, belief: Belief) -> None:
+        if not self.layout.articulations:
+            return
+        joints = {joint.name: joint for joint in belief.joints}
+        for k, name in enumerate(self.layout.articulations):
+            joint = joints[name]
+            out["articulation_position"][k] = np.clip(joint.position, -OPEN, OPEN)
+            out["articulation_deviation"][k] = min(float(np.sqrt(joint.variance)), OPEN)
+            if joint.last_seen is not None:
+                out["articulation_seen"][k] = 1
+                out["articulation_age"][k] = min(max(belief.stamp - joint.last_seen, 0) / NANOSECONDS, AGE)
 
     def _look(self, out: Arrays, belief: Belief) -> None:
         """What nothing explains; between segmented images the share of the last one holds."""
@@ -270,7 +294,17 @@ def decode(arrays: Arrays, layout: Layout, robot: KinematicTree) -> tuple[Belief
     T_map_camera = T_map_base @ robot.forward(dict(zip(JOINTS, joints.positions.tolist(), strict=True)))[CAMERA]
     tracks = tuple(_track(arrays, int(slot), layout, stamp, T_map_camera) for slot in np.flatnonzero(arrays["mask"]))
     localization = Localization(stamp, T_map_base, covariance, status)
-    return Belief(stamp, localization, T_map_camera, tracks, _regions(arrays, stamp), None, frozenset()), joints
+    seen = _regions(arrays, stamp)
+    doors = tuple(_joint(arrays, k, name, stamp) for k, name in enumerate(layout.articulations))
+    return Belief(stamp, localization, T_map_camera, tracks, seen, None, frozenset(), joints=doors), joints
+
+
+def _joint(arrays: Arrays, k: int, name: str, stamp: int) -> JointEstimate:
+    seen = bool(arrays["articulation_seen"][k])
+    last = stamp - round(float(arrays["articulation_age"][k]) * NANOSECONDS) if seen else None
+    status = TrackStatus.TENTATIVE if last is None else TrackStatus.CONFIRMED
+    variance = float(arrays["articulation_deviation"][k]) ** 2
+    return JointEstimate(name, stamp, float(arrays["articulation_position"][k]), variance, 0.0, last, status)
 
 
 def _regions(arrays: Arrays, stamp: int) -> Presegmentation | None:

@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -57,6 +57,8 @@ class Truth:
     """(supported, supporter): touches it from above; supporters are objects or furniture."""
     touching: frozenset[tuple[str, str]]
     """Pairs in alphabetical order that touch anyhow."""
+    joints: Mapping[str, float] = field(default_factory=dict)
+    """Positions of the building's doors and drawers, rad or m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,9 @@ class GroundTruth:
         self._scratch = mujoco.MjData(world.model)
         self._sensors = {frame: world.model.body(body).id for frame, body in SENSOR_BODIES.items()}
         self._movable = {name: body for name, body in world.bodies.items() if name != "robot"}
+        self._joints = {
+            moving.part.name: int(world.model.joint(moving.joint).qposadr[0]) for moving in world.static.moving
+        }
         self._contacts = _ContactLog(world, history.key)
         self._alone: RayScene | None = None
         self._lidar: dict[int, Int32] = {}
@@ -127,7 +132,8 @@ class GroundTruth:
         contacts, touching = self._contacts.at(stamp)
         base = body_pose(scratch, self._world.bodies["robot"])
         camera, lidar = (body_pose(scratch, self._sensors[frame]) for frame in ("camera", "lidar"))
-        return Truth(stamp, base, camera, lidar, objects, contacts, touching)
+        joints = {name: float(scratch.qpos[address]) for name, address in self._joints.items()}
+        return Truth(stamp, base, camera, lidar, objects, contacts, touching, joints)
 
     def joint_positions(self, stamp: int) -> dict[str, float]:
         """True positions of the robot's joints, rad or m."""

@@ -87,6 +87,7 @@ SCRIPTED = {
     "active-perception": "simtrack.envs.policies.agents:explorer",
     "localize": "simtrack.envs.policies.agents:tour",
     "tidy": "simtrack.envs.policies.tidy:TidyPolicy",
+    "fetch-meal": "simtrack.envs.policies.fetch_meal:FetchMealPolicy",
 }
 """Task -> function that makes its scripted policy from (briefing, mode)."""
 POLICIES = ("random", "still", "scripted")

@@ -11,6 +11,7 @@ TASKS = {
     "active-perception": "simtrack.envs.tasks.active_perception:ActivePerception",
     "localize": "simtrack.envs.tasks.localize:Localize",
     "tidy": "simtrack.envs.tasks.tidy:Tidy",
+    "fetch-meal": "simtrack.envs.tasks.fetch_meal:FetchMeal",
 }
 """Name -> where its class is."""
 

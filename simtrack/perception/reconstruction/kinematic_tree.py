@@ -79,7 +79,7 @@ def kinematic_tree(
         T_map_base = np.asarray(candidate.T_map_model, float)
         parent = links.get((graph.supports[entity].parent, (parts or {}).get(entity, "")), parent)
         joint = BodyJoint(f"{body_name}/{kind}", kind, parent, inverse(poses[parent]) @ T_map_base)
-        made = _bodies_of(candidate, body_name, joint, node.semantic_class, taken)
+        made = bodies_of(candidate, body_name, joint, node.semantic_class, taken)
         bodies += made
         for part, body in zip(_parts_in_order(candidate), made, strict=True):
             assert body.joint is not None
@@ -118,13 +118,11 @@ def scaled_mass(candidate: CadCandidate) -> float:
 
 
 def _parts_in_order(candidate: CadCandidate) -> list[str]:
-    """Names of the parts as `_bodies_of` makes bodies of them."""
+    """Names of the parts as `bodies_of` makes bodies of them."""
     return [candidate.model.parts[0].name, *(joint.child for joint in candidate.model.joints)]
 
 
-def _bodies_of(
-    candidate: CadCandidate, name: str, joint: BodyJoint, semantic_class: str, taken: set[str]
-) -> list[Body]:
+def bodies_of(candidate: CadCandidate, name: str, joint: BodyJoint, semantic_class: str, taken: set[str]) -> list[Body]:
     """Base and moving parts; the frame of a moving part is at the anchor of its joint."""
     model, scale = candidate.model, candidate.scale
     poses = model.part_poses(candidate.positions)
