@@ -4,7 +4,12 @@ __version__ = "0.1.0"
 
 import gymnasium as _gymnasium
 
-_ENVIRONMENTS = {"ActivePerception": "active-perception", "Localize": "localize"}
+_ENVIRONMENTS = {
+    "ActivePerception": "active-perception",
+    "Localize": "localize",
+    "Tidy": "tidy",
+    "FetchMeal": "fetch-meal",
+}
 """Name of an environment -> its task; the code is imported when one is made."""
 
 for _name, _task in _ENVIRONMENTS.items():

@@ -15,7 +15,7 @@ Conventions (used everywhere in simtrack)
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -177,6 +177,28 @@ class Room:
 
 
 @dataclass(frozen=True, slots=True)
+class Articulation:
+    """A piece of the map that a joint lets move: a door, a drawer. Everything is in the map, with the joint at 0."""
+
+    name: str
+    """Unique, e.g. ``fridge1/door``."""
+    semantic_class: str
+    """Of the furniture that it belongs to."""
+    kind: Literal["revolute", "prismatic"]
+    anchor: Float64
+    """(3,), a point of the axis, metres."""
+    axis: Float64
+    """(3,), unit vector; about it, right-handed, or along it the joint moves."""
+    lower: float
+    """Radians or metres."""
+    upper: float
+    vertices: Float32
+    """(V, 3), metres."""
+    faces: Int32
+    """(F, 3), counter-clockwise seen from the free side."""
+
+
+@dataclass(frozen=True, slots=True)
 class StaticMap:
     """What was surveyed of the static world: one mesh with labels. Never the simulated world itself."""
 
@@ -188,6 +210,8 @@ class StaticMap:
     rooms: tuple[Room, ...] = ()
     noise: float = 0.005
     """Standard deviation of the surface, metres, as the surveyor states it."""
+    articulations: tuple[Articulation, ...] = ()
+    """What joints let move; none of it is part of the mesh."""
 
 
 # ------------------------------------------------------------------------------------------------------------ detection
@@ -419,6 +443,26 @@ class Relation:
 
 
 @dataclass(frozen=True, slots=True)
+class JointEstimate:
+    """How far a piece of furniture is believed to be open."""
+
+    name: str
+    """Of its `Articulation`."""
+    stamp: int
+    """Nanoseconds."""
+    position: float
+    """Radians or metres."""
+    variance: float
+    """rad^2 or m^2; that of a uniform distribution over the joint's range where nothing is known."""
+    velocity: float
+    """rad/s or m/s."""
+    last_seen: int | None
+    """Nanoseconds, of the last image that told of it; None if none did."""
+    status: TrackStatus
+    """TENTATIVE: never seen; LOST: the images contradict every position that was tried."""
+
+
+@dataclass(frozen=True, slots=True)
 class Belief:
     """All that the stack believes after one camera frame: the only thing an agent sees."""
 
@@ -440,6 +484,8 @@ class Belief:
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
     """Stage name -> wall time spent on this frame, and beside the frames on what was taken up with it. Measured, not
     simulated."""
+    joints: tuple[JointEstimate, ...] = ()
+    """One for each articulation of the map, in its order."""
 
 
 # --------------------------------------------------------------------------------------------------------------- acting

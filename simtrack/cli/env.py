@@ -1,10 +1,12 @@
 """``simtrack env``: let a policy play an environment."""
 
-import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from simtrack.envs.play import EpisodeResult
 
 
 def env(
@@ -12,6 +14,7 @@ def env(
     policy: Literal["scripted", "random", "still"] = "scripted",
     episodes: int = 1,
     seed: int = 0,
+    scene: tuple[str, ...] = (),
     observation: tuple[str, ...] = ("belief",),
     feed: Literal["belief", "state"] = "belief",
     seconds: float | None = None,
@@ -19,6 +22,7 @@ def env(
     keypoint_error: float | None = None,
     video: Path | None = None,
     record: Path | None = None,
+    record_as: Literal["mcap", "bop"] = "mcap",
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
     threads: int = 1,
 ) -> int:
@@ -29,21 +33,20 @@ def env(
         policy: What acts.
         episodes: How many are played; episode k has the seed SEED + k.
         seed: Of the first episode.
+        scene: Name or path of a scene; the task's own if not given. With several, such as a kitchen and its
+            reconstruction, the same episodes are played in each, and their figures stand side by side.
         observation: Observation modes: belief, state, rgbd.
         feed: What a scripted policy sees: what is believed, or the truth (which must then be observed, too).
         seconds: Length of an episode; the task's own if not given.
         miss_rate: Share of visible objects that the detector does not find; the oracle's own if not given.
         keypoint_error: Median error of the detector's keypoints as a share of the object's size.
         video: Write a video of all episodes to this file.
-        record: Write an MCAP log of each episode to this folder.
-        json_file: Write the figures of each episode to this file.
+        record: Record each episode to this folder.
+        record_as: Logs that simtrack replay reads, or a data set in the format of BOP.
+        json_file: Keep the figures of each episode in this file; those that it has already are not played again.
         threads: Threads of the compiled kernels.
     """
-    import gymnasium as gym
-
     from simtrack.cli import console
-    from simtrack.envs.play import play
-    from simtrack.envs.wrappers import Recorder, Video
     from simtrack.errors import InvalidValueError
     from simtrack.evaluation.closed_loop import set_threads
 
@@ -56,30 +59,69 @@ def env(
         "seconds": seconds,
         "detector_errors": {name: value for name, value in errors.items() if value is not None},
     }
-    made: gym.Env = gym.make(full_id(env_id), disable_env_checker=True, **arguments)
+    columns = []
+    for number, name in enumerate(scene or (None,)):
+        chosen = arguments if name is None else {**arguments, "scene": name}
+        own = number if len(scene) > 1 else None
+        kept, film, log = (_numbered(path, own) for path in (json_file, video, record))
+        if len(scene) > 1:
+            print(f"{name}:", flush=True)
+        seeds = range(seed, seed + episodes)
+        columns.append(_played(full_id(env_id), policy, feed, seeds, chosen, kept, film, log, record_as))
+    rows = [("success", *(f"{sum(r.success for r in results)}/{episodes}" for results in columns))]
+    rows += [("return", *(f"{sum(r.total for r in results) / episodes:.3f}" for results in columns))]
+    for name in columns[0][0].metrics:
+        rows.append((name, *(f"{sum(r.metrics[name] for r in results) / episodes:.4g}" for results in columns)))
+    heads = list(scene) if len(scene) > 1 else ["value"]
+    console.show_table(("mean over episodes", *heads), rows, right=range(1, 1 + len(heads)))
+    return 0
+
+
+def _numbered(path: Path | None, number: int | None) -> Path | None:
+    """A path of its own for each of several scenes."""
+    return path if path is None or number is None else path.with_name(f"{path.stem}-{number}{path.suffix}")
+
+
+def _played(
+    env_id: str,
+    policy: str,
+    feed: "Literal['belief', 'state']",
+    seeds: range,
+    arguments: dict[str, Any],
+    json_file: Path | None,
+    video: Path | None,
+    record: Path | None,
+    record_as: str,
+) -> "list[EpisodeResult]":
+    """Episodes of one scene; those that the file has are not played again."""
+    import gymnasium as gym
+
+    from simtrack.envs.bop_recorder import BopRecorder
+    from simtrack.envs.episodes import EpisodeFile
+    from simtrack.envs.play import play
+    from simtrack.envs.wrappers import Recorder, Video
+
+    made: gym.Env = gym.make(env_id, disable_env_checker=True, **arguments)
     if video is not None:
         made = Video(made, video)
     if record is not None:
-        made = Recorder(made, record)
+        made = Recorder(made, record) if record_as == "mcap" else BopRecorder(made, record)
     with made:
-        results = []
-        for result in play(made, policy, range(seed, seed + episodes), feed):
+        kept = None
+        if json_file is not None:
+            kept = EpisodeFile(json_file, {"env": env_id, "policy": policy, "feed": feed, **arguments})
+        done = kept.results if kept is not None else {}
+        results = [done[number] for number in seeds if number in done]
+        for result in play(made, policy, [number for number in seeds if number not in done], feed):
             print(
                 f"seed {result.seed}: return {result.total:.2f}, {'success' if result.success else 'no success'}, "
                 + ", ".join(f"{name} {value:.3g}" for name, value in result.metrics.items()),
                 flush=True,
             )
             results.append(result)
-    names = list(results[0].metrics)
-    mean = {name: sum(r.metrics[name] for r in results) / episodes for name in names}
-    rows = [("success", f"{sum(r.success for r in results)}/{episodes}")]
-    rows += [("return", f"{sum(r.total for r in results) / episodes:.3f}")]
-    rows += [(name, f"{value:.4g}") for name, value in mean.items()]
-    console.show_table(("mean over episodes", "value"), rows, right=(1,))
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps([result.plain() for result in results], indent=1) + "\n")
-    return 0
+            if kept is not None:
+                kept.add(result)
+    return results
 
 
 def full_id(name: str) -> str:

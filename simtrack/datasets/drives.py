@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,20 +10,19 @@ from simtrack.contracts import (
     NANOSECONDS,
     Agent,
     Command,
-    Int32,
     JointState,
     LidarScan,
     MapEntity,
     Odometry,
     RgbdFrame,
 )
-from simtrack.datasets.annotate import Annotator, Owners
-from simtrack.datasets.content import Placed
-from simtrack.datasets.frame import Category, LabelledFrame, LidarLabels, SceneInfo, StuffCategory
+from simtrack.datasets.annotate import Annotator
+from simtrack.datasets.frame import LabelledFrame, SceneInfo, StuffCategory
 from simtrack.datasets.randomness import random_of, seed_of
 from simtrack.datasets.recipe import DriveViews, Recipe
 from simtrack.datasets.relations import Relations
-from simtrack.datasets.stages import FAR, category_of, depth_noise, map_entities, scene_of, stuff_categories
+from simtrack.datasets.simulated import SimulationLabels, stuff_of, target_categories
+from simtrack.datasets.stages import FAR, depth_noise, map_entities, scene_of
 from simtrack.errors import FileFormatError, UnknownNameError
 from simtrack.objects import ObjectModel, load_object
 from simtrack.perception.pipeline import PerceptionStack
@@ -36,8 +35,6 @@ from simtrack.simulation.world import build_static
 
 CAMERA_RATE = 30.0
 """Images a second that the robot's camera takes; labelled ones are every n-th."""
-LOOSE = ("robot", "hand")
-"""Classes of what moves and is no object."""
 
 
 @dataclass(slots=True)
@@ -78,8 +75,7 @@ class Drives:
         models: dict[str, ObjectModel] = {}
         for scene in self._scenes:
             models |= {thing.model: load_object(thing.model) for thing in scene.objects}
-        self.categories = tuple(Category(k, model) for k, model in enumerate(models.values(), start=1))
-        self._of_model = {category.model.name: category.id for category in self.categories}
+        self.categories = target_categories(list(models.values()))
         self._stuff = self._all_stuff()
         self.stuff = tuple(self._stuff.values())
         self._annotator = Annotator(recipe.camera.intrinsics, FAR)
@@ -106,7 +102,7 @@ class Drives:
         drive = self._drive(scene)
         command, joints, index = drive.start, JointState(0, (), np.zeros(0)), 0
         simulation, stack = drive.simulation, drive.stack
-        owners, things, segments = _owners(simulation), self._things(simulation), self._segments(simulation)
+        labels = SimulationLabels(simulation, self.categories, self._stuff, self._annotator)
         for number in range(self._step * (self.frames_per_scene - 1) + 1):
             labelled = number % self._step == 0
             want_rgb = labelled or stack.wants_image(simulation.now + simulation.camera_period)
@@ -119,7 +115,11 @@ class Drives:
                     case LidarScan():
                         drive.scan = frame if self._views.lidar else None
                     case RgbdFrame() if labelled and frame.rgb is not None:
-                        yield self._label(drive, frame, index, owners, things, segments)
+                        scan, drive.scan = drive.scan, None
+                        yield labels.label(
+                            frame, scene, index, scan=scan, odometry=drive.odometry, relations=drive.relations,
+                            entities=drive.entities,
+                        )  # fmt: skip
                         index += 1
                 if (belief := stack.process(frame)) is not None:
                     command = drive.agent.act(belief, joints)
@@ -171,94 +171,10 @@ class Drives:
         self._open = None
         self._exits.close()
 
-    # -------------------------------------------------------------------------------------------------------- one frame
-
-    def _label(
-        self, drive: _Drive, frame: RgbdFrame, index: int, owners: Owners, things: list[Placed], segments: Int32
-    ) -> LabelledFrame:
-        simulation, truth = drive.simulation, drive.simulation.truth.at(frame.stamp)
-        rays = simulation.truth.rays(frame.stamp).scene
-        placed = tuple(replace(thing, T_map_object=truth.objects[thing.name].T_map_object) for thing in things)
-        view = self._annotator.look(rays, owners, truth.T_map_camera)
-        support = tuple(sorted(truth.contacts))
-        scan, drive.scan = drive.scan, None
-        assert frame.rgb is not None
-        return LabelledFrame(
-            scene=drive.scene,
-            index=index,
-            stamp=frame.stamp,
-            intrinsics=frame.intrinsics,
-            T_map_camera=truth.T_map_camera,
-            rgb=frame.rgb,
-            depth=frame.depth,
-            clean_depth=view.depth,
-            normals=view.normals,
-            ids=view.ids,
-            names=simulation.truth.names,
-            segment_categories=segments,
-            labels=self._annotator.annotate(placed, rays, truth.T_map_camera, view.ids, frame.depth),
-            lidar=None if scan is None else _lidar_labels(simulation, scan),
-            odometry=drive.odometry,
-            T_map_base=truth.T_map_base,
-            joints=simulation.truth.joint_positions(frame.stamp),
-            support=support,
-            relations=drive.relations.of(placed, drive.entities, support),
-        )
-
-    def _things(self, simulation: Simulation) -> list[Placed]:
-        """Objects and clutter, wherever they are."""
-        world, rays = simulation.world, simulation.truth.rays(0)
-        instances = {thing.name: k for k, thing in enumerate(rays.moving, 0 if rays.fixed is None else 1)}
-        things = []
-        for name, model in world.objects.items():
-            category = self._of_model[model.name] if world.is_catalogue(name) else None
-            things.append(
-                Placed(
-                    instance=world.names.index(name),
-                    ray_instance=instances[name],
-                    name=name,
-                    semantic_class=model.semantic_class,
-                    category=category,
-                    mesh=rays.scene.mesh(instances[name]),
-                    T_map_object=np.eye(4),
-                    scale=np.ones(3),
-                    extents=model.extents,
-                    keypoints=model.keypoints if category is not None else np.empty((0, 3)),
-                )
-            )
-        return things
-
     # ------------------------------------------------------------------------------------------------------- categories
 
     def _all_stuff(self) -> dict[tuple[str, bool], StuffCategory]:
         """(class, whether instances are told apart) -> category; the same for every seed."""
         parts = [part for scene in self._scenes for part in build_static(scene, 0).parts]
-        loose = {load_object(thing.model).semantic_class for scene in self._scenes for thing in scene.clutter}
-        return stuff_categories({part.semantic_class for part in parts}, {*loose, *LOOSE}, len(self.categories))
-
-    def _segments(self, simulation: Simulation) -> Int32:
-        """(N,), category of each of the simulation's names."""
-        world = simulation.world
-        parts = {part.name: part.semantic_class for part in world.static.parts}
-        categories = []
-        for name in world.names:
-            if name in world.objects and world.is_catalogue(name):
-                categories.append(self._of_model[world.objects[name].name])
-                continue
-            loose = name in world.objects or name in LOOSE
-            semantic_class = world.objects[name].semantic_class if name in world.objects else parts.get(name, name)
-            categories.append(category_of(self._stuff, semantic_class, loose))
-        return np.array(categories, np.int32)
-
-
-def _owners(simulation: Simulation) -> Owners:
-    """Ids of the simulation's ray instances: `World.names` by index."""
-    rays, names = simulation.truth.rays(0), simulation.world.names
-    first = 0 if rays.fixed is None else 1
-    whole = {k: names.index(thing.name) for k, thing in enumerate(rays.moving, first)}
-    return Owners(whole, {} if rays.fixed is None else {rays.fixed: rays.face_ids(rays.fixed)})
-
-
-def _lidar_labels(simulation: Simulation, scan: LidarScan) -> LidarLabels:
-    truth = simulation.truth
-    return LidarLabels(scan, truth.at(scan.stamp).T_map_lidar, truth.lidar_ids(scan.stamp))
+        clutter = {load_object(thing.model).semantic_class for scene in self._scenes for thing in scene.clutter}
+        return stuff_of({part.semantic_class for part in parts}, clutter, len(self.categories))

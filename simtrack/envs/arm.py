@@ -19,7 +19,18 @@ READY: Mapping[str, float] = {
     "arm_6_joint": 1.12, "arm_7_joint": 0.0,
 }  # fmt: skip
 """Posture before the chest, above tables, with the cup pointing down: the search for joint angles begins here."""
-ASIDE: Mapping[str, float] = {**READY, "arm_1_joint": -1.57}
+LEVEL: Mapping[str, float] = {
+    "arm_1_joint": 0.0, "arm_2_joint": -0.7, "arm_3_joint": 0.0, "arm_4_joint": 1.6, "arm_5_joint": 0.0,
+    "arm_6_joint": -0.9, "arm_7_joint": 0.0,
+}  # fmt: skip
+"""Posture before the chest with the cup pointing forward, the elbow up: the search begins here if the cup shall not
+point down."""
+DOWN = np.array([0.0, 0.0, -1.0])
+RAISED: Mapping[str, float] = {**READY, "arm_2_joint": -1.08, "arm_4_joint": 1.1, "arm_6_joint": 1.3}
+"""The same 11 cm higher, with the cup tilted by 15 degrees: things are carried over others."""
+UPWARDS = ("arm_2_joint", "arm_4_joint", "arm_6_joint")
+"""Joints that lead from `READY` to `RAISED`."""
+ASIDE: Mapping[str, float] = {**RAISED, "arm_1_joint": -1.57}
 """The same beside the robot: on the way from the tucked posture, over the edge of a table."""
 
 
@@ -61,22 +72,33 @@ class ArmKinematics:
         return self._tree.forward(joints)[GRIPPER] @ transform(translation=(CUP[0], CUP[1], CUP[2]))
 
     def solve(
-        self, position: Float64, torso: float, start: Mapping[str, float] = READY, yaw: float | None = None
+        self,
+        position: Float64,
+        torso: float,
+        start: Mapping[str, float] | None = None,
+        yaw: float | None = None,
+        direction: Float64 | None = None,
+        level: bool = False,
     ) -> dict[str, float] | None:
-        """Joint angles that bring the cup to a place, pointing straight down.
+        """Joint angles that bring the cup to a place, pointing straight down or in another direction.
 
         Args:
             position: (3,), of the rim, base frame, metres.
             torso: lift, metres.
-            start: joint angles, radians, to begin with; the answer is one near them.
-            yaw: heading of the cup's y axis about the vertical, radians, base frame; any if None.
+            start: joint angles, radians, to begin with; the answer is one near them. `READY` or `LEVEL` if None.
+            yaw: heading of the cup's y axis about the vertical, radians, base frame; any if None. Only if it points
+                down.
+            direction: (3,), unit vector in which the cup sucks, base frame; down if None.
+            level: with a direction that is horizontal: the cup's z axis shall point up.
 
         Returns:
             Joint name -> radians, or None if the place is out of reach.
         """
         config = self.config
+        fresh = start is None or start is READY
+        start = (READY if direction is None else LEVEL) if start is None else start
         q = np.array([start.get(name, TUCKED[name]) for name in ARM])
-        if start is READY:  # turned towards the place, which is where most answers lie
+        if fresh:  # turned towards the place, which is where most answers lie
             q[0] = np.arctan2(position[1], position[0] - SHOULDER)
             wrist = 0.0 if yaw is None else q[0] + np.pi / 2 - yaw  # the cup's y axis points to the left in READY
             q[6] = np.arctan2(np.sin(wrist), np.cos(wrist))
@@ -84,10 +106,15 @@ class ArmKinematics:
         home = q.copy()
         for _ in range(config.iterations):
             pose, J = self._linearised(q, torso)
-            error, close = self._error(pose, position, yaw)
+            if level and direction is not None:
+                error, close = self._pose_error(pose, position, direction)
+            else:
+                error, close = self._error(pose, position, yaw, DOWN if direction is None else direction)
             if close:
                 return dict(zip(ARM, q.tolist(), strict=True))
-            J = J if yaw is not None else J[: len(error)]
+            if direction is not None and not level:  # turning about the cup's axis is free
+                J[3:] -= np.outer(direction, direction @ J[3:])
+            J = J[: len(error)]
             JJ = J @ J.T + config.damping**2 * np.eye(len(J))
             change = J.T @ np.linalg.solve(JJ, error)
             free = np.eye(len(q)) - J.T @ np.linalg.solve(JJ, J)
@@ -96,22 +123,34 @@ class ArmKinematics:
             q = np.clip(q + change, self._low, self._high)
         return None
 
-    def _error(self, pose: Float64, position: Float64, yaw: float | None) -> tuple[Float64, bool]:
-        """What is missing: metres, tilt about x and y, and, if asked for, turn about z; and whether it is little."""
+    def _error(self, pose: Float64, position: Float64, yaw: float | None, direction: Float64) -> tuple[Float64, bool]:
+        """What is missing: metres, tilt, and, if asked for, turn about z instead of its z; and whether it is little."""
         gap = position - pose[:3, 3]
         axis = pose[:3, 0]
-        tilt = np.cross(axis, [0.0, 0.0, -1.0])
-        if axis[2] > 0.0:  # pointing up: any way round
+        tilt = np.cross(axis, direction)
+        ahead = float(axis @ direction)
+        if ahead < 0.0:  # pointing the other way: any way round
             tilt = tilt / max(float(np.linalg.norm(tilt)), 1e-6)
-        error = [*gap, tilt[0], tilt[1]]
         close = float(np.linalg.norm(gap)) < self.config.translation
-        close &= axis[2] < 0.0 and float(np.hypot(tilt[0], tilt[1])) < self.config.tilt
+        close &= ahead > 0.0 and float(np.linalg.norm(tilt)) < self.config.tilt
         if yaw is not None:
             turn = yaw - float(np.arctan2(pose[1, 1], pose[0, 1]))
-            turn = float(np.arctan2(np.sin(turn), np.cos(turn)))
-            error.append(turn)
-            close &= abs(turn) < 2.0 * self.config.tilt
-        return np.array(error), bool(close)
+            tilt[2] = float(np.arctan2(np.sin(turn), np.cos(turn)))
+            close &= abs(tilt[2]) < 2.0 * self.config.tilt
+        elif direction is DOWN:
+            tilt = tilt[:2]
+        return np.array([*gap, *tilt]), bool(close)
+
+    def _pose_error(self, pose: Float64, position: Float64, direction: Float64) -> tuple[Float64, bool]:
+        """What is missing to a pose that looks along a horizontal direction, z up: metres, rotation vector."""
+        wanted = np.stack([direction, [-direction[1], direction[0], 0.0], [0.0, 0.0, 1.0]], axis=1)
+        gap = position - pose[:3, 3]
+        turn = 0.5 * np.cross(pose[:3, :3].T, wanted.T).sum(axis=0)
+        if float(np.trace(pose[:3, :3].T @ wanted)) < 1.0:  # more than a right angle: any way round
+            turn = turn / max(float(np.linalg.norm(turn)), 1e-6)
+        near = float(np.linalg.norm(gap)) < self.config.translation
+        close = near and float(np.linalg.norm(turn)) < self.config.tilt and float(pose[:3, 0] @ direction) > 0.0
+        return np.array([*gap, *turn]), close
 
     def _linearised(self, q: Float64, torso: float) -> tuple[Float64, Float64]:
         """The cup's pose and its (6, 7) Jacobian: translation, then rotation, base frame."""

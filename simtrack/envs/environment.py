@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from simtrack.contracts import Command, Float32, Uint8
-from simtrack.envs.actions import AXES, Steering
+from simtrack.contracts import Command, Float32, Relation, Uint8
+from simtrack.envs.actions import Steering, axes, request_of
 from simtrack.envs.observations import Arrays, Encoder, Layout, encode_image, encode_robot
 from simtrack.envs.policies import Briefing
 from simtrack.envs.settings import (
     CONTROL_HZ,
     Settings,
+    articulations_of,
     classes_of,
     fixed_building,
     furniture_of,
@@ -22,6 +23,7 @@ from simtrack.envs.task import Moment, Score, Task
 from simtrack.envs.tasks import make_task
 from simtrack.envs.window import check_display, has_display
 from simtrack.errors import FileFormatError, InvalidValueError
+from simtrack.objects import load_object
 from simtrack.simulation.scene_file import load_scene
 
 if TYPE_CHECKING:
@@ -73,9 +75,10 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
             raise InvalidValueError("argument", unknown[0], ", ".join(known))
         self.settings = Settings(observation, **arguments)
         self.task = make_task(task)
-        self.task_name = task if isinstance(task, str) else type(task).__name__
+        self.task_name = self.task.script or type(self.task).__name__
         chosen = with_objects(load_scene(scene or self.task.scene), self.settings.objects)
         self.scene = self.task.adapt(fixed_building(chosen))
+        self.task.check(self.scene)
         self.render_mode = self._checked(render_mode)
         if not has_display():
             self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}  # type: ignore[misc]
@@ -83,13 +86,13 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         seconds = self.settings.seconds or self.task.seconds
         self.layout = Layout(
             classes_of(self.scene), self.settings.slots, furniture_of(self.scene), seconds, camera.intrinsics,
-            camera.max_range,
+            camera.max_range, self.task.macros, articulations_of(self.scene),
         )  # fmt: skip
         spaces = {mode: self.layout.space(mode) for mode in self.settings.modes}
         self.observation_space = (
             spaces[self.settings.modes[0]] if self._single else gym.spaces.Dict(spaces)  # type: ignore[assignment]
         )
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (len(AXES),), np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (len(axes(self.task.macros)),), np.float32)
         robot = self.scene.robot
         posture = Command(head_pan=robot.head_pan, head_tilt=robot.head_tilt, torso=robot.torso)
         self.steering = Steering(posture, 1.0 / CONTROL_HZ)
@@ -137,8 +140,11 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
             encoder.reset()
         self._steps = 0
         self._snapshot = loop.step(self.steering.command)  # the sensors' first look
-        score = self.task.score(Moment(0.0, self._snapshot.truth, self._snapshot.belief))
-        return self._shown(self._snapshot, score)
+        return self._shown(self._snapshot, self._judge(self._snapshot))
+
+    def _judge(self, snapshot: "Snapshot") -> Score:
+        seconds = self._steps / CONTROL_HZ
+        return self.task.score(Moment(seconds, snapshot.truth, snapshot.belief, snapshot.holding))
 
     def _built(self) -> "Loop":
         """The world, built on first need."""
@@ -165,17 +171,17 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         """Act for a tenth of a second.
 
         Raises:
-            InvalidValueError: the environment was not reset, or the action is not an array (5,) of finite numbers.
+            InvalidValueError: the environment was not reset, or the action is not an array (A,) of finite numbers.
         """
         if self._loop is None or self._snapshot is None:
             raise InvalidValueError("step", "an environment that was not reset", "step after reset")
         if np.shape(action) != self.action_space.shape or not np.isfinite(action).all():
             raise InvalidValueError("action", action, f"an array {self.action_space.shape} of finite numbers")
         self.task.act(self._loop.simulation, self._steps / CONTROL_HZ)
-        self._snapshot = self._loop.step(self.steering.apply(action))
+        request = request_of(action, self.task.macros) if self.task.macros else None
+        self._snapshot = self._loop.step(self.steering.apply(action, self._loop.busy or request is not None), request)
         self._steps += 1
-        moment = Moment(self._steps / CONTROL_HZ, self._snapshot.truth, self._snapshot.belief)
-        score = self.task.score(moment)
+        score = self._judge(self._snapshot)
         observation, info = self._shown(self._snapshot, score)
         truncated = self._steps >= self.steps and not score.terminated
         if self.render_mode == "human":
@@ -203,7 +209,7 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
             assert snapshot.image is not None
             return {
                 **encode_image(snapshot.image, self.layout),
-                **encode_robot(snapshot.felt, snapshot.truth.stamp),
+                **encode_robot(snapshot.felt, snapshot.truth.stamp, self.layout),
             }
         belief = snapshot.belief if mode == "belief" else snapshot.state
         assert belief is not None
@@ -215,7 +221,12 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         """What an agent may know before it starts: survey, robot, posture, layout; never the truth."""
         loop = self._built()
         simulation = loop.simulation
-        return Briefing(simulation.static_map, simulation.robot, self.steering.start, self.layout, self.settings.modes)
+        classes = {thing.id: load_object(thing.model).name for thing in self.scene.objects}
+        goals = (Relation(*(classes.get(n, n) for n in (g.subject, g.name, g.reference))) for g in self.task.goals)
+        return Briefing(
+            simulation.static_map, simulation.robot, self.steering.start, self.layout, self.settings.modes,
+            simulation.models, tuple(goals),
+        )  # fmt: skip
 
     @property
     def snapshot(self) -> "Snapshot | None":
@@ -234,7 +245,7 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         if self._view is None:
             from simtrack.envs.view import View
 
-            self._view = View(self._loop.simulation)
+            self._view = View(self._loop.simulation, self.task.eye, self.task.focus)
         picture = self._view.picture(self._snapshot.truth)
         if self.render_mode == "rgb_array":
             return picture

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from simtrack.contracts import Relation
 from simtrack.errors import InvalidValueError, UnknownNameError
-from simtrack.perception.scene_graph import RELATIONS, Body, RelationConfig, model_shapes, relation_margin
+from simtrack.perception.scene_graph import RELATIONS, MarginMeter, RelationConfig, model_shapes
 from simtrack.simulation.ground_truth import Truth
 
 if TYPE_CHECKING:
@@ -70,7 +70,12 @@ class Goals:
             if goal.reference not in models and goal.name != "on":
                 raise InvalidValueError("goal", goal, "'on' for furniture; other relations between objects")
         shapes = model_shapes({model.name: model for model in models.values()})
-        self._shapes = {name: shapes[model.name] for name, model in models.items()}
+        of = {name: shapes[model.name] for name, model in models.items()}
+        self._meters = {
+            goal: MarginMeter(of[goal.subject], goal.name, of[goal.reference], self._config)
+            for goal in goals
+            if goal.name != "on"
+        }
 
     def states(self, truth: Truth) -> list[GoalState]:
         """Each goal at one moment, in their order."""
@@ -83,6 +88,5 @@ class Goals:
             carriers = {below for above, below in truth.contacts if above == goal.subject}
             holds = goal.reference in {name.partition("/")[0] for name in carriers} | carriers
             return GoalState(goal, holds and resting, 0.0 if holds else -1.0)
-        bodies = [Body(self._shapes[name], truth.objects[name].T_map_object) for name in (goal.subject, goal.reference)]
-        margin = relation_margin(bodies[0], goal.name, bodies[1], self._config)
+        margin = self._meters[goal].margin(subject.T_map_object, truth.objects[goal.reference].T_map_object)
         return GoalState(goal, margin >= 0.0 and resting, margin)

@@ -1,13 +1,16 @@
 """The world, the robot's sensors and what is made of them, one control step at a time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from simtrack.contracts import Belief, Command, DetectionResult, JointState, Odometry, RgbdFrame, SensorFrame
+from simtrack.envs.actions import Request
+from simtrack.envs.macros import Manipulator
 from simtrack.envs.observations import Proprioception
+from simtrack.envs.requests import begin
 from simtrack.envs.resolution import noise_in_small_images, stack_config
-from simtrack.envs.settings import CONTROL_NS, Settings, pixel_scale
+from simtrack.envs.settings import Settings, pixel_scale
 from simtrack.envs.truth import IdealPerception, true_belief
 from simtrack.perception.localization import MeshLocalizer
 from simtrack.perception.pipeline import PerceptionStack
@@ -20,8 +23,10 @@ from simtrack.simulation.simulation import Simulation
 
 BUILDING_SEED = 0
 """Decides what belongs to the building and not to an episode: the survey, and how the tracker's models are off."""
-SCAN_KEY = 20_000_000
-"""Nanoseconds between the moments of a lidar's turn: at 2 m/s^2 a straight line between them errs by 0.1 mm."""
+KEY = 20_000_000
+"""Nanoseconds between the states that are remembered: all sensors look at multiples of it."""
+SCAN_KEY = 50_000_000
+"""Nanoseconds between the moments of a lidar's turn: at 1 m/s^2 a straight line between them errs by 0.3 mm."""
 MEMORY = 2_000_000_000
 """Nanoseconds of the past that are kept."""
 
@@ -40,6 +45,8 @@ class Snapshot:
     """The camera's image, where there is one."""
     feed: tuple[SensorFrame | DetectionResult, ...] = ()
     """What arrived since the last step: sensor frames, and the detector's answers after the images they belong to."""
+    holding: str | None = None
+    """Name of the object that the gripper truly holds."""
 
 
 class Loop:
@@ -56,8 +63,12 @@ class Loop:
         self.simulation = Simulation(
             scene, BUILDING_SEED, settings.renderer, camera, settings.lidar,
             sensors=settings.sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
-            scan_key=SCAN_KEY, servo=KEY_NS,
+            scan_key=SCAN_KEY, servo=KEY_NS, key=KEY,
         )  # fmt: skip
+        self.manipulator = Manipulator(self.simulation) if scene.robot.suction else None
+        """Arm and cup, where there is one."""
+        self.colours = "rgbd" in settings.modes
+        """Whether images have colour; the oracle does not look at it."""
         self._ideal = IdealPerception(self.simulation, camera)
         self._stack: PerceptionStack | None = None
         self._felt = Proprioception(JointState(0, (), np.zeros(0)), 0.0, 0.0)
@@ -75,6 +86,8 @@ class Loop:
         simulation = self.simulation
         simulation.restart(seed)
         self._ideal.reset()
+        if self.manipulator is not None:
+            self.manipulator.reset()
         self._belief = self._image = None
         if self.has_stack:
             old, self._stack = self._stack, self._make_stack(seed)
@@ -96,18 +109,27 @@ class Loop:
             config=stack_config(pixel_scale(simulation.camera)),
         )
 
-    def step(self, command: Command) -> Snapshot:
-        """Run for one control step under a command."""
-        simulation, colours = self.simulation, "rgbd" in self._settings.modes
-        if self._stack is not None:
-            colours = colours or self._stack.wants_image(simulation.now + CONTROL_NS)
+    @property
+    def busy(self) -> bool:
+        """Whether the arm is at work."""
+        return self.manipulator is not None and self.manipulator.busy
+
+    def step(self, command: Command, request: Request | None = None) -> Snapshot:
+        """Run for one control step under a command; what the arm is asked for begins if it is not at work."""
+        simulation = self.simulation
+        if self.manipulator is not None:
+            if request is not None and not self.manipulator.busy and self._belief is not None:
+                begin(self.manipulator, request, self._belief, simulation.models, simulation.static_map)
+            self.manipulator.step(None if self._belief is None else self._belief.localization.T_map_base)
+            if self.manipulator.busy:
+                command = replace(command, linear=self.manipulator.drive, angular=0.0)
         self._feed.clear()
-        for frame in simulation.advance(command, want_rgb=colours):
+        for frame in simulation.advance(command, want_rgb=self.colours):
             self._feed.append(frame)
             if isinstance(frame, JointState):
-                self._felt = Proprioception(frame, self._felt.linear, self._felt.angular)
+                self._felt = replace(self._felt, joints=frame)
             elif isinstance(frame, Odometry):
-                self._felt = Proprioception(self._felt.joints, frame.linear, frame.angular)
+                self._felt = replace(self._felt, linear=frame.linear, angular=frame.angular)
             elif isinstance(frame, RgbdFrame):
                 self._image = frame
             if self._stack is not None:
@@ -121,9 +143,13 @@ class Loop:
             visible = self._ideal.visible(truth)
             state = true_belief(truth, visible) if "state" in self._settings.modes else None
             belief = self._ideal.process(truth, visible) if self._stack is None else None
-        belief = belief or self._belief
+        belief = self._belief = belief or self._belief
         assert belief is not None
-        return Snapshot(truth, belief, state, self._felt, self._image, tuple(self._feed))
+        felt, holding = self._felt, None
+        if self.manipulator is not None:
+            held, holding = self.manipulator.held, self.manipulator.cup.holding
+            felt = replace(felt, macro=self.manipulator.outcome, holding=held.class_name if held is not None else None)
+        return Snapshot(truth, belief, state, felt, self._image, tuple(self._feed), holding)
 
     def _end_stack(self) -> None:
         if self._stack is not None:

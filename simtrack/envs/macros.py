@@ -6,13 +6,13 @@ it truly touches, or nothing. No pose is ever set.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from simtrack.contracts import Float64
-from simtrack.envs.arm import ARM, ASIDE, READY, ArmKinematics
+from simtrack.envs.actions import Outcome
+from simtrack.envs.arm import ARM, ASIDE, RAISED, READY, UPWARDS, ArmKinematics
 from simtrack.envs.grasps import suction_spot
 from simtrack.geometry.transforms import apply, inverse, yaw_of
 from simtrack.objects import ObjectModel
@@ -41,31 +41,20 @@ PATIENCE = 60
 """Control steps that a joint may take to its target."""
 
 
-class Outcome(StrEnum):
-    """How a macro fared."""
-
-    IDLE = "idle"
-    BUSY = "busy"
-    DONE = "done"
-    NO_SPOT = "no-spot"
-    """The object has no flat spot on top."""
-    OUT_OF_REACH = "out-of-reach"
-    MISSED = "missed"
-    """The cup came down where the object is believed to be, and touched nothing."""
-    EMPTY = "empty"
-    """There is nothing in the cup to be placed."""
-
-
 @dataclass(frozen=True, slots=True)
 class Held:
     """What the robot believes to hold."""
 
+    class_name: str
+    """Name of its model."""
     T_map_object: Float64
     """(4, 4), where it was believed to be when it was grasped."""
     cup: Float64
     """(3,), the cup's rim at that moment, map frame."""
     yaw: float
     """Heading of the cup's y axis at that moment, map frame, radians."""
+    T_cup_object: Float64
+    """(4, 4), as it was believed at that moment."""
 
 
 class Manipulator:
@@ -75,7 +64,9 @@ class Manipulator:
         """Take hold of the robot; raises InvalidValueError if it has no suction cup."""
         self._simulation = simulation
         self.cup = SuctionCup(simulation)
-        self._arm = ArmKinematics(simulation.robot)
+        self.arm = ArmKinematics(simulation.robot)
+        self.T_map_base = np.eye(4)
+        """(4, 4), where the base is believed to be now."""
         self.reset()
 
     def reset(self) -> None:
@@ -84,6 +75,8 @@ class Manipulator:
         self.outcome = Outcome.IDLE
         """Of the macro that runs or ran last."""
         self.held: Held | None = None
+        self.drive: float = 0.0
+        """m/s at which the macro that runs wants the base to go."""
         self._tucked = True
         self._motion: Motion = iter(())
 
@@ -100,7 +93,7 @@ class Manipulator:
             model: of the object, as the robot knows it.
             T_map_base: (4, 4), believed.
         """
-        self._begin(self._grasp(T_map_object, model, T_map_base))
+        self.begin(self._grasp(T_map_object, model, T_map_base))
 
     def place(
         self, position: Float64, T_map_base: Float64, turns: Sequence[float] = (), clearance: float = 0.03
@@ -113,17 +106,25 @@ class Manipulator:
             turns: by how much the object may be turned about the vertical, radians; as it comes if none is given.
             clearance: least height above its place from which it comes down, metres: over the rim of a box, say.
         """
-        self._begin(self._place(np.asarray(position, dtype=float), T_map_base, turns or (None,), clearance))
+        self.begin(self._place(np.asarray(position, dtype=float), T_map_base, turns or (None,), clearance))
 
-    def step(self) -> None:
-        """Go on with the macro, if one runs: once before each control step."""
+    def refuse(self, outcome: Outcome) -> None:
+        """Do not even begin, for this reason."""
+        self._motion, self.outcome = iter(()), outcome
+
+    def begin(self, motion: Motion) -> None:
+        """Begin any motion: it sets the outcome when it ends."""
+        self._motion, self.outcome = motion, Outcome.BUSY
+
+    def step(self, T_map_base: Float64 | None = None) -> None:
+        """Go on with the macro, if one runs: once before each control step; `T_map_base` (4, 4) is believed."""
+        self.drive = 0.0
+        if T_map_base is not None:
+            self.T_map_base = T_map_base
         if self.busy:
             next(self._motion, None)
 
     # -------------------------------------------------------------------------------------------------------- motions
-
-    def _begin(self, motion: Motion) -> None:
-        self._motion, self.outcome = motion, Outcome.BUSY
 
     def _grasp(self, T_map_object: Float64, model: ObjectModel, T_map_base: Float64) -> Motion:
         spot = suction_spot(model, T_map_object)
@@ -135,22 +136,24 @@ class Manipulator:
         if above is None or self._solve(target, above) is None:
             self.outcome = Outcome.OUT_OF_REACH
             return
-        yield from self._unfold()
-        yield from self._go(above)
+        yield from self.unfold()
+        yield from self._approach(above)
         touched = False
         for depth in np.arange(HOVER - DOWN, -DEEPER, -DOWN):
-            lower = self._solve(target + (0.0, 0.0, float(depth)), self._joints())
+            lower = self._solve(target + (0.0, 0.0, float(depth)), self.joints())
             if lower is None:
                 break
-            yield from self._go(lower)
+            yield from self.go(lower)
             if touched := self.cup.close() is not None:
                 break
         if touched:
-            T_base_cup = self._arm.cup(self._joints() | {TORSO: self._torso()})
+            T_base_cup = self.arm.cup(self.joints() | {TORSO: self.torso()})
             cup = apply(T_map_base, T_base_cup[:3, 3][None])[0]
             heading = yaw_of(T_map_base) + float(np.arctan2(T_base_cup[1, 1], T_base_cup[0, 1]))
-            self.held = Held(T_map_object.copy(), cup, heading)
+            T_cup_object = inverse(T_map_base @ T_base_cup) @ T_map_object
+            self.held = Held(model.name, T_map_object.copy(), cup, heading, T_cup_object)
         yield from self._lift(target)
+        yield from self._raise()
         self.outcome = Outcome.DONE if touched else Outcome.MISSED
 
     def _place(self, position: Float64, T_map_base: Float64, turns: Sequence[float | None], clearance: float) -> Motion:
@@ -168,15 +171,15 @@ class Manipulator:
             self.outcome = Outcome.OUT_OF_REACH
             return
         height, above, down = best
-        yield from self._go(above)
+        yield from self._approach(above)
         for share in np.linspace(0.0, 1.0, int(np.ceil(height / DOWN)) + 1)[1:]:
-            yield from self._go({name: above[name] + share * (down[name] - above[name]) for name in ARM})
-        yield from self._wait(2)
+            yield from self.go({name: above[name] + share * (down[name] - above[name]) for name in ARM})
+        yield from self.wait(2)
         self.cup.open()
         self.held = None
-        yield from self._wait(2)
-        yield from self._go(above)
-        yield from self._go(READY)
+        yield from self.wait(2)
+        yield from self.go(above)
+        yield from self._raise()
         self.outcome = Outcome.DONE
 
     def _cup_for(
@@ -188,17 +191,27 @@ class Manipulator:
         target = apply(inverse(T_map_base), (position + lever)[None])[0] + (0.0, 0.0, RELEASE)
         return target, None if turn is None else held.yaw + turn - yaw_of(T_map_base)
 
-    def _unfold(self) -> Motion:
+    def unfold(self) -> Motion:
         """From the tucked posture beside the robot to the one before its chest."""
         if self._tucked:
-            yield from self._go(ASIDE)
+            yield from self.go(ASIDE)
+            yield from self.go(RAISED)
             self._tucked = False
-        yield from self._go(READY)
+
+    def _approach(self, joints: Mapping[str, float]) -> Motion:
+        """To joint angles with the cup over a place, and down to it at the end."""
+        yield from self.go({name: RAISED[name] if name in UPWARDS else angle for name, angle in joints.items()})
+        yield from self.go(joints)
+
+    def _raise(self) -> Motion:
+        """Up from where the arm is, and then before the chest: over whatever stands there."""
+        yield from self.go({name: RAISED[name] for name in UPWARDS})
+        yield from self.go(RAISED)
 
     def _lift(self, target: Float64) -> Motion:
         _, joints = self._highest(target, None)
         if joints is not None:
-            yield from self._go(joints)
+            yield from self.go(joints)
 
     def _highest(self, target: Float64, heading: float | None) -> tuple[float, dict[str, float] | None]:
         """How far above a place the cup can be held, up to `CARRY` metres, and the joint angles that do so."""
@@ -208,7 +221,7 @@ class Manipulator:
                 return height, joints
         return 0.0, None
 
-    def _go(self, joints: Mapping[str, float]) -> Motion:
+    def go(self, joints: Mapping[str, float]) -> Motion:
         """Until the servos' setpoints are at the targets, and one step for the arm to follow."""
         controller = self._simulation.world.controller
         controller.reach(joints)
@@ -219,18 +232,25 @@ class Manipulator:
                 break
         yield
 
-    def _wait(self, steps: int) -> Motion:
+    def wait(self, steps: int) -> Motion:
+        """Hold still."""
         for _ in range(steps):
             yield
 
-    def _joints(self) -> dict[str, float]:
+    def follow(self, joints: Mapping[str, float]) -> None:
+        """New targets for the arm's servos, from now on."""
+        self._simulation.world.controller.reach(joints)
+
+    def joints(self) -> dict[str, float]:
+        """Joint of the arm -> where its servo is asked to be, radians."""
         setpoints = self._simulation.world.controller.setpoints
         return {name: setpoints[name] for name in ARM}
 
-    def _torso(self) -> float:
+    def torso(self) -> float:
+        """Lift, metres."""
         return self._simulation.world.controller.setpoints[TORSO]
 
     def _solve(
         self, position: Float64, start: Mapping[str, float] = READY, heading: float | None = None
     ) -> dict[str, float] | None:
-        return self._arm.solve(position, self._torso(), start, heading)
+        return self.arm.solve(position, self.torso(), start, heading)

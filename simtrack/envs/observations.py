@@ -15,6 +15,7 @@ from simtrack.contracts import (
     NANOSECONDS,
     Belief,
     CameraIntrinsics,
+    JointEstimate,
     JointState,
     Localization,
     Presegmentation,
@@ -24,6 +25,7 @@ from simtrack.contracts import (
     Track,
     TrackStatus,
 )
+from simtrack.envs.actions import Outcome
 from simtrack.evaluation.record import graph_name
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import (
@@ -49,11 +51,14 @@ AGE = 600.0
 """Seconds: bound of ages."""
 VARIANCE = 100.0
 """m^2 or rad^2: bound of the elements of covariances."""
+OPEN = 7.0
+"""Radians or metres: bound of the positions of doors and drawers."""
 REGIONS = 12
 """Regions of unexplained measurements that are reported at most, the largest first."""
 STATUSES = tuple(TrackStatus)
 ANSWERS = (Status.OK, Status.AMBIGUOUS, Status.LOST)
 """Statuses of the localization that are told apart; any other counts as a predicted pose."""
+OUTCOMES = tuple(Outcome)
 JOINTS = (HEAD_PAN, HEAD_TILT, TORSO)
 
 
@@ -77,6 +82,10 @@ class Layout:
     """Of the robot's camera."""
     depth_range: float
     """Metres: the largest depth that the camera reads."""
+    macros: tuple[str, ...] = ()
+    """What the arm can be asked for."""
+    articulations: tuple[str, ...] = ()
+    """Names of the map's doors and drawers."""
 
     def space(self, mode: str) -> spaces.Dict:
         """The space of one mode; finite bounds, metres, radians, row 0 on top."""
@@ -107,14 +116,24 @@ class Layout:
             "base_deviation": _box((3,), 0.0, np.sqrt(VARIANCE)),
             "localization": _box((len(ANSWERS) + 1,), 0, 1, np.int8),
         }
+        if self.articulations:
+            count = (len(self.articulations),)
+            entries["articulation_position"] = _box(count, -OPEN, OPEN)
+            entries["articulation_deviation"] = _box(count, 0.0, OPEN)
+            entries["articulation_age"] = _box(count, 0.0, AGE)
+            entries["articulation_seen"] = _box(count, 0, 1, np.int8)
         return spaces.Dict({**entries, **self._robot()})
 
     def _robot(self) -> dict[str, spaces.Space]:
-        return {
+        entries: dict[str, spaces.Space] = {
             "joints": _box((3,), -np.pi, np.pi),
             "speed": _box((2,), -SPEED, SPEED),
             "time": _box((1,), 0.0, self.seconds + 1.0),
         }
+        if self.macros:
+            entries["macro"] = _box((len(OUTCOMES),), 0, 1, np.int8)
+            entries["holding"] = _box((len(self.classes),), 0, 1, np.int8)
+        return entries
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +146,10 @@ class Proprioception:
     """m/s, by the wheels."""
     angular: float
     """rad/s, by the wheels."""
+    macro: Outcome = Outcome.IDLE
+    """Of the arm."""
+    holding: str | None = None
+    """Class of what the cup is believed to hold, as long as its vacuum holds."""
 
 
 class Encoder:
@@ -157,6 +180,7 @@ class Encoder:
         for slot, track in kept:
             self._write(out, slot, track, belief.stamp)
         self._relate(out, belief, kept)
+        self._articulate(out, belief)
         self._look(out, belief)
         where = belief.localization
         x, y = where.T_map_base[:2, 3]
@@ -166,7 +190,7 @@ class Encoder:
         out["base_deviation"][:] = np.minimum(deviation, np.sqrt(VARIANCE))
         answer = ANSWERS.index(where.status) if where.status in ANSWERS else len(ANSWERS)
         out["localization"][answer] = 1
-        out.update(encode_robot(felt, belief.stamp))
+        out.update(encode_robot(felt, belief.stamp, self.layout))
         return out
 
     def _assign(self, tracks: Sequence[Track]) -> list[tuple[int, Track]]:
@@ -201,6 +225,18 @@ class Encoder:
                 at = rows[relation.subject], columns[relation.reference], self._relation[relation.name]
                 out["relations"][at] = 1
 
+    def _articulate(self, out: Arrays, belief: Belief) -> None:
+        if not self.layout.articulations:
+            return
+        joints = {joint.name: joint for joint in belief.joints}
+        for k, name in enumerate(self.layout.articulations):
+            joint = joints[name]
+            out["articulation_position"][k] = np.clip(joint.position, -OPEN, OPEN)
+            out["articulation_deviation"][k] = min(float(np.sqrt(joint.variance)), OPEN)
+            if joint.last_seen is not None:
+                out["articulation_seen"][k] = 1
+                out["articulation_age"][k] = min(max(belief.stamp - joint.last_seen, 0) / NANOSECONDS, AGE)
+
     def _look(self, out: Arrays, belief: Belief) -> None:
         """What nothing explains; between segmented images the share of the last one holds."""
         if belief.camera is not None:
@@ -219,16 +255,20 @@ class Encoder:
         return last != seen.stamp
 
 
-def encode_robot(felt: Proprioception, stamp: int) -> Arrays:
+def encode_robot(felt: Proprioception, stamp: int, layout: Layout) -> Arrays:
     """Arrays of what the robot feels of itself."""
     positions = dict(zip(felt.joints.names, felt.joints.positions.tolist(), strict=True))
     joints = np.array([positions.get(name, 0.0) for name in JOINTS], np.float32)
     speed = np.clip(np.array([felt.linear, felt.angular], np.float32), -SPEED, SPEED)
-    return {
+    out: Arrays = {
         "joints": np.clip(joints, -np.float32(np.pi), np.float32(np.pi)),
         "speed": speed,
         "time": np.array([stamp / NANOSECONDS], np.float32),
     }
+    if layout.macros:
+        out["macro"] = np.array([felt.macro is outcome for outcome in OUTCOMES], np.int8)
+        out["holding"] = np.array([felt.holding == name for name in layout.classes], np.int8)
+    return out
 
 
 def encode_image(frame: RgbdFrame, layout: Layout) -> Arrays:
@@ -254,7 +294,17 @@ def decode(arrays: Arrays, layout: Layout, robot: KinematicTree) -> tuple[Belief
     T_map_camera = T_map_base @ robot.forward(dict(zip(JOINTS, joints.positions.tolist(), strict=True)))[CAMERA]
     tracks = tuple(_track(arrays, int(slot), layout, stamp, T_map_camera) for slot in np.flatnonzero(arrays["mask"]))
     localization = Localization(stamp, T_map_base, covariance, status)
-    return Belief(stamp, localization, T_map_camera, tracks, _regions(arrays, stamp), None, frozenset()), joints
+    seen = _regions(arrays, stamp)
+    doors = tuple(_joint(arrays, k, name, stamp) for k, name in enumerate(layout.articulations))
+    return Belief(stamp, localization, T_map_camera, tracks, seen, None, frozenset(), joints=doors), joints
+
+
+def _joint(arrays: Arrays, k: int, name: str, stamp: int) -> JointEstimate:
+    seen = bool(arrays["articulation_seen"][k])
+    last = stamp - round(float(arrays["articulation_age"][k]) * NANOSECONDS) if seen else None
+    status = TrackStatus.TENTATIVE if last is None else TrackStatus.CONFIRMED
+    variance = float(arrays["articulation_deviation"][k]) ** 2
+    return JointEstimate(name, stamp, float(arrays["articulation_position"][k]), variance, 0.0, last, status)
 
 
 def _regions(arrays: Arrays, stamp: int) -> Presegmentation | None:

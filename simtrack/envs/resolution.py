@@ -35,7 +35,10 @@ def stack_config(scale: float) -> StackConfig:
         growth=max(1, round(seen.growth * scale)),
         join=seen.join / scale,
     )
-    return replace(stack, tracker=tracker, presegmentation=seen, lidar_presegmentation_every=LIDAR_SEGMENTS)
+    joints = replace(stack.articulation, registration=tracker.registration)
+    return replace(
+        stack, tracker=tracker, articulation=joints, presegmentation=seen, lidar_presegmentation_every=LIDAR_SEGMENTS
+    )
 
 
 def _registration(config: RegistrationConfig, scale: float) -> RegistrationConfig:

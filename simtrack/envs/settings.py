@@ -178,6 +178,15 @@ def classes_of(scene: SceneFile) -> tuple[str, ...]:
     return tuple(sorted({load_object(thing.model).name for thing in scene.objects}))
 
 
+def articulations_of(scene: SceneFile) -> tuple[str, ...]:
+    """Names of the doors and drawers of a scene's building, in its order."""
+    if scene.static.builder != "mjcf":
+        return ()
+    from simtrack.simulation.mjcf_world import mjcf_building
+
+    return tuple(moving.part.name for moving in mjcf_building(scene, supports=False).moving)
+
+
 def pixel_scale(camera: CameraModel) -> float:
     """Size of a thing in an image of this camera over that in the Xtion's."""
     return float(np.divide(camera.intrinsics.fy, XTION.intrinsics.fy))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from simtrack.contracts import Belief, Float64, Localization, Relation, Status, Track, TrackStatus
+from simtrack.contracts import Belief, Float64, JointEstimate, Localization, Relation, Status, Track, TrackStatus
 from simtrack.geometry.meshes import sample_surface
 from simtrack.geometry.transforms import apply, inverse
 from simtrack.sensors.camera import CameraModel
@@ -64,7 +64,11 @@ def true_belief(truth: Truth, visible: Mapping[str, float] | None = None) -> Bel
 
 def _belief(truth: Truth, tracks: tuple[Track, ...], relations: frozenset[Relation]) -> Belief:
     where = Localization(truth.stamp, truth.T_map_base, _CERTAIN, Status.OK, 1.0)
-    return Belief(truth.stamp, where, truth.T_map_camera, tracks, None, None, relations)
+    joints = tuple(
+        JointEstimate(name, truth.stamp, position, 0.0, 0.0, truth.stamp, TrackStatus.CONFIRMED)
+        for name, position in truth.joints.items()
+    )
+    return Belief(truth.stamp, where, truth.T_map_camera, tracks, None, None, relations, joints=joints)
 
 
 class IdealPerception:

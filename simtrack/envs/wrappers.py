@@ -14,15 +14,16 @@ from simtrack.contracts import Float32, Uint8
 from simtrack.envs.actions import MOVES, vector
 from simtrack.envs.environment import SimtrackEnv
 from simtrack.envs.observations import MODES
+from simtrack.envs.skills import Skills, skill_names
 from simtrack.errors import InvalidValueError, RenderingError, UnknownNameError
 
 EGOCENTRIC = 4.0
 """Metres that stand for 1 in a flat observation: of places relative to the robot, which are cut off at 3."""
 FLAT = (
     "mask", "class", "position", "velocity", "deviation", "status", "age", "visible", "moving", "unexplained",
-    "regions", "regions_mask", "base_deviation", "localization", "joints", "speed", "time",
+    "regions", "regions_mask", "base_deviation", "localization", "joints", "speed", "time", "macro", "holding",
 )  # fmt: skip
-"""Entries of a flat observation; ``deviation`` are the standard deviations of covariance."""
+"""Entries of a flat observation, as far as there are such; ``deviation`` are standard deviations of covariance."""
 
 
 def simtrack_env(env: gym.Env) -> SimtrackEnv:
@@ -34,21 +35,33 @@ def simtrack_env(env: gym.Env) -> SimtrackEnv:
 
 
 class DiscreteActions(gym.ActionWrapper):
-    """A handful of moves instead of speeds: see `simtrack.envs.actions.MOVES`."""
+    """A handful of moves instead of speeds, and things to be grasped and put by name instead of by place.
+
+    See `simtrack.envs.actions.MOVES` and `simtrack.envs.skills`. Names are looked up in what the robot believes; one
+    that cannot be tried, such as to grasp what is not known, does nothing.
+    """
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        simtrack_env(env)
-        self.names = tuple(MOVES)
+        self._inner = simtrack_env(env)
+        self._macros = self._inner.task.macros
+        self.names = (*MOVES, *skill_names(self._inner.layout.classes, self._macros))
         """What each action does."""
-        self._moves = [vector(move) for move in MOVES.values()]
-        self.action_space = gym.spaces.Discrete(len(self._moves))
+        self._moves = [vector(move, self._macros) for move in MOVES.values()]
+        self._skills: Skills | None = None
+        self.action_space = gym.spaces.Discrete(len(self.names))
 
     def action(self, action: Any) -> Float32:
-        """The speeds of a move."""
-        if not 0 <= int(action) < len(self._moves):
-            raise InvalidValueError("action", action, f"0 to {len(self._moves) - 1}")
-        return self._moves[int(action)].copy()
+        """The numbers that a move or a macro stands for."""
+        if not 0 <= int(action) < len(self.names):
+            raise InvalidValueError("action", action, f"0 to {len(self.names) - 1}")
+        if int(action) < len(self._moves):
+            return self._moves[int(action)].copy()
+        request, snapshot, loop = None, self._inner.snapshot, self._inner.loop
+        if snapshot is not None and loop is not None and loop.manipulator is not None and not loop.busy:
+            self._skills = self._skills or Skills(self._inner.briefing())
+            request = self._skills.request(self.names[int(action)], snapshot.belief, loop.manipulator.held)
+        return self._moves[0].copy() if request is None else request.action(self._macros)
 
 
 class FlatBelief(gym.ObservationWrapper):
@@ -89,7 +102,7 @@ class FlatBelief(gym.ObservationWrapper):
         arrays["deviation"] = np.sqrt(np.maximum(variances, 0.0)) / np.array([0.05] * 3 + [0.2] * 3)
         arrays["base_deviation"] = arrays["base_deviation"] / np.array([0.05, 0.05, 0.2])
         arrays["age"], arrays["time"] = arrays["age"] / 10.0, arrays["time"] / self._seconds
-        flat = np.concatenate([np.asarray(arrays[name], dtype=np.float32).ravel() for name in FLAT])
+        flat = np.concatenate([np.asarray(arrays[name], dtype=np.float32).ravel() for name in FLAT if name in arrays])
         return np.clip(flat, -3.0, 3.0)
 
 
@@ -138,7 +151,7 @@ class Video(gym.Wrapper):
         if loop is None or snapshot is None:
             raise RenderingError("there is nothing to be seen before the first reset")
         if self._view is None:
-            self._view = View(loop.simulation)
+            self._view = View(loop.simulation, self._inner.task.eye, self._inner.task.focus)
         picture = self._view.picture(snapshot.truth)
         pose = self._view.pose(snapshot.truth)
         picture = draw_belief(picture, INTRINSICS, pose, snapshot.belief, loop.simulation.models)

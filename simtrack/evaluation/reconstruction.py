@@ -19,7 +19,8 @@ from simtrack.objects.cad import CAD_CLASSES
 from simtrack.perception.reconstruction.reconstruct import Choice, Reconstruction
 from simtrack.perception.scene_graph.contact import ContactGraph, EntityMesh
 from simtrack.perception.scene_graph.contact.nodes import SCENE
-from simtrack.plausibility.verdict import CheckReport
+from simtrack.plausibility.check import ENGINES
+from simtrack.plausibility.verdict import CheckConfig, CheckReport, JointResult
 from simtrack.simulation.building.rooms.physics import RoomEntity, SettledRoom
 
 Entities: TypeAlias = Literal["true", "partial"]
@@ -69,6 +70,19 @@ class BodyOutcome:
 
 
 @dataclass(frozen=True, slots=True)
+class JointOutcome:
+    """How a joint of a model fared in the engines, the worse of both."""
+
+    name: str
+    sound: bool
+    """No engine holds anything against it: it leads where it says, and not into its own object."""
+    alone: float
+    """Share of its range that its own object leaves it."""
+    free: float
+    """Share of its range that is free with everything else in its place, what can be lifted excepted."""
+
+
+@dataclass(frozen=True, slots=True)
 class RoomOutcome:
     """Everything that is found in one room from one kind of entities."""
 
@@ -87,6 +101,8 @@ class RoomOutcome:
     models: tuple[ModelOutcome, ...]
     bodies: tuple[BodyOutcome, ...]
     """Empty if the physics was not checked."""
+    joints: tuple[JointOutcome, ...]
+    """Likewise."""
     verdict: str
     problems: tuple[str, ...]
     """What speaks against the scene, as the check words it."""
@@ -234,6 +250,7 @@ def outcome(
         leaning=(len(actual), len(actual & found), len(found)),
         models=models,
         bodies=bodies,
+        joints=() if report is None else joint_outcomes(report),
         verdict="not checked" if report is None else report.verdict,
         problems=()
         if report is None
@@ -243,6 +260,22 @@ def outcome(
         graph_seconds=seconds[0],
         seconds=seconds[1],
         cpu_seconds=seconds[2],
+    )
+
+
+def joint_outcomes(report: CheckReport) -> tuple[JointOutcome, ...]:
+    """Every joint in the engine in which it fares worse; one that an engine did not move is not sound."""
+    found: dict[str, list[JointResult]] = {}
+    for joint in (joint for engine in report.engines for joint in engine.joints):
+        found.setdefault(joint.name, []).append(joint)
+    return tuple(
+        JointOutcome(
+            name=name,
+            sound=len(rows) == len(ENGINES) and not any(row.problems for row in rows),
+            alone=min(row.reached_alone for row in rows),
+            free=min(row.reached for row in rows),
+        )
+        for name, rows in found.items()
     )
 
 
@@ -337,7 +370,9 @@ def _physics_figures(outcomes: Sequence[RoomOutcome]) -> Metrics:
     bodies = [body for room in checked for body in room.bodies]
     agreements = [(room.agreement, len(room.bodies)) for room in checked if room.agreement is not None]
     agreed = sum(share * count for share, count in agreements)
-    none = "no free bodies"
+    joints = [joint for room in checked for joint in room.joints]
+    least = CheckConfig().least_range
+    none, no_joints = "no free bodies", "no joints"
     return {
         "physics.stable_scenes": ratio(sum(room.stable for room in checked), len(checked), "no scenes"),
         "physics.plausible_scenes": ratio(sum(r.verdict == "plausible" for r in checked), len(checked), "no scenes"),
@@ -345,6 +380,10 @@ def _physics_figures(outcomes: Sequence[RoomOutcome]) -> Metrics:
         "physics.stable_bodies": ratio(sum(body.stable for body in bodies), len(bodies), none),
         "physics.penetration.p99": quantile([body.penetration for body in bodies], 0.99, "m", none),
         "physics.gap.p99": quantile([body.gap for body in bodies if body.gap is not None], 0.99, "m", none),
+        "physics.joints": measured(len(joints), "1"),
+        "physics.joints.full_range": ratio(sum(j.sound and j.alone >= 1.0 for j in joints), len(joints), no_joints),
+        "physics.joints.can_open": ratio(sum(j.sound and j.free >= least for j in joints), len(joints), no_joints),
+        "physics.joints.free": ratio(sum(j.free >= 1.0 for j in joints), len(joints), no_joints),
         "physics.agreement": ratio(agreed, sum(count for _, count in agreements), "one engine only"),
         "physics.margin": measured(max(room.margin for room in checked), "m"),
     }
@@ -362,4 +401,5 @@ def outcome_from_json(document: dict[str, Any]) -> RoomOutcome:
         fixed[name] = tuple(fixed[name])
     fixed["models"] = tuple(ModelOutcome(**row) for row in fixed["models"])
     fixed["bodies"] = tuple(BodyOutcome(**row) for row in fixed["bodies"])
+    fixed["joints"] = tuple(JointOutcome(**row) for row in fixed["joints"])
     return RoomOutcome(**fixed)

@@ -4,14 +4,15 @@ The tracking paper shares one geometric scene between localization, tracking and
 pre-segmentation cast into this scene, in the map frame; the tracker registers the same meshes in the camera frame.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
-from simtrack.contracts import StaticMap, Track
+from simtrack.contracts import Articulation, JointEstimate, StaticMap, Track
 from simtrack.objects import ObjectModel
+from simtrack.perception.tracking.articulation import believed_poses
 from simtrack.raycast import RayScene, TriangleMesh
 
 MAP = 0
-"""Instance id of the static map; the instance of a track has the track's id, which is 1 or more."""
+"""Instance id of the static map; those of what joints let move follow, then those of tracks by their ids."""
 
 
 class BelievedScene:
@@ -21,27 +22,43 @@ class BelievedScene:
         self._place(
             TriangleMesh(static_map.vertices, static_map.faces),
             {name: TriangleMesh(m.mesh.vertices, m.mesh.faces) for name, m in models.items()},
+            static_map.articulations,
+            [TriangleMesh(a.vertices, a.faces) for a in static_map.articulations],
         )
 
-    def _place(self, static: TriangleMesh, meshes: Mapping[str, TriangleMesh]) -> None:
+    def _place(
+        self,
+        static: TriangleMesh,
+        meshes: Mapping[str, TriangleMesh],
+        articulations: Sequence[Articulation],
+        parts: Sequence[TriangleMesh],
+    ) -> None:
         self.scene = RayScene()
         self.scene.add(static, instance=MAP)
+        for number, part in enumerate(parts, MAP + 1):
+            self.scene.add(part, instance=number)
+        self._articulations, self._parts = articulations, parts
         self._meshes = meshes
         self._placed: dict[int, str] = {}
 
     def twin(self) -> "BelievedScene":
         """Another scene of the same meshes, for another thread: only the map is in it yet."""
         other = BelievedScene.__new__(BelievedScene)
-        other._place(self.scene.mesh(MAP), self._meshes)
+        other._place(self.scene.mesh(MAP), self._meshes, self._articulations, self._parts)
         return other
 
     def close(self) -> None:
         """Release the scene's memory."""
         self.scene.close()
 
-    def update(self, tracks: Iterable[Track]) -> None:
-        """Place the believed tracks where they are believed to be, and remove all others."""
-        believed = {t.id: t for t in tracks if t.believed}
+    def update(self, tracks: Iterable[Track], joints: Sequence[JointEstimate] = ()) -> None:
+        """Place the believed tracks where they are believed to be, and remove all others; doors as far open as that."""
+        if self._parts:
+            poses = believed_poses(self._articulations, joints)
+            self.scene.set_poses(
+                range(MAP + 1, MAP + 1 + len(self._parts)), [poses[a.name] for a in self._articulations]
+            )
+        believed = {len(self._parts) + t.id: t for t in tracks if t.believed}
         for instance in [i for i in self._placed if i not in believed]:
             self.scene.remove(instance)
             del self._placed[instance]

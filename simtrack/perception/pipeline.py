@@ -35,6 +35,7 @@ from simtrack.contracts import (
     DetectionResult,
     Detector,
     Float64,
+    JointEstimate,
     JointState,
     LidarScan,
     Localization,
@@ -61,6 +62,7 @@ from simtrack.perception.localization.measurement import scan_end
 from simtrack.perception.presegmenter import Presegmenter
 from simtrack.perception.scene_graph import SceneGraph, SceneGraphConfig
 from simtrack.perception.self_filter import SelfFilter
+from simtrack.perception.tracking.articulation import ArticulationConfig, ArticulationTracker
 from simtrack.perception.tracking.presegmentation import PresegmentationConfig, shot_stamps
 from simtrack.perception.tracking.target import TrackerConfig
 from simtrack.perception.tracking.tracker import ObjectTracker
@@ -77,6 +79,7 @@ class StackConfig:
     localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
     presegmentation: PresegmentationConfig = field(default_factory=PresegmentationConfig)
     scene_graph: SceneGraphConfig = field(default_factory=SceneGraphConfig)
+    articulation: ArticulationConfig = field(default_factory=ArticulationConfig)
     lidar_silence: float = 0.5
     """Without a scan for this long, seconds, depth images localize the robot."""
     lidar_presegmentation_every: int = 2
@@ -133,6 +136,9 @@ class PerceptionStack:
         self._correction = Beside[Localization](self._correction_thread, c.correction_time)
         self.localizer = localizer or self._mesh_localizer(static_map, T_map_base)
         self.tracker = tracker or ObjectTracker(models, self.config.tracker)
+        self.articulation = (
+            ArticulationTracker(static_map, self.config.articulation) if static_map.articulations else None
+        )
         self.graph = SceneGraph(static_map, models, self.config.scene_graph)
         self.detections = DetectorRunner(detector, models, self.config.runner)
         self.on_detection: Callable[[DetectionResult], None] | None = None
@@ -160,6 +166,8 @@ class PerceptionStack:
         self._correction_thread.shutdown()
         self._believed.close()
         self._presegmenter.close()
+        if self.articulation is not None:
+            self.articulation.close()
         self.detections.close()
         if isinstance(self.tracker, ObjectTracker):
             self.tracker.close()
@@ -210,7 +218,7 @@ class PerceptionStack:
             return
         if self._scan is not None:
             self._settle_scan(self._scan, end)
-        self._believed.update(self._belief.tracks if self._belief is not None else ())
+        self._believe()
         self._own_shots, self._scan_joints = None, self._joint_positions(scan.stamp)
         self._scan = scan
         self._correction.begin(end, self.localizer.begin(scan))
@@ -242,7 +250,8 @@ class PerceptionStack:
         if self._scans % self.config.lidar_presegmentation_every == 0 and not self._presegmenter.scan.busy:
             poses = {stamp: self.localizer.pose_at(stamp).T_map_base for stamp in shot_stamps(scan)}
             tracks = self._belief.tracks if self._belief is not None else ()
-            self._presegmenter.begin_scan(now, scan, poses, tracks, self._own_lidar_shots(scan))
+            joints = self._belief.joints if self._belief is not None else ()
+            self._presegmenter.begin_scan(now, scan, poses, tracks, self._own_lidar_shots(scan), joints)
 
     def _take_image(self, frame: RgbdFrame) -> Belief:
         if self._belief is not None and frame.stamp <= self._belief.stamp:
@@ -265,10 +274,13 @@ class PerceptionStack:
             hypotheses = self._guard("detection", lambda: self.detections.collect(frame.stamp), [])
         with self._timed("tracking"):
             tracked = self._track(frame, T_map_camera, covariance, hypotheses)
+        with self._timed("articulation"):
+            joints = self._articulated(frame, T_map_camera, covariance)
         camera = self._settle_segmentation(frame.stamp)
         if wanted:
             self._segmented = frame
-            self._presegmenter.begin_image(frame, T_map_camera, tracked.tracks, self._joint_positions(frame.stamp))
+            own = self._joint_positions(frame.stamp)
+            self._presegmenter.begin_image(frame, T_map_camera, tracked.tracks, own, joints)
         with self._timed("scene_graph"):
             relations = self._guard("scene_graph", lambda: self._relate(frame.stamp, tracked), frozenset())
 
@@ -280,6 +292,7 @@ class PerceptionStack:
             camera=camera,
             lidar=self._lidar,
             relations=relations,
+            joints=joints,
             status=dict(self._status),
             stage_seconds=dict(self._seconds),
         )
@@ -298,7 +311,7 @@ class PerceptionStack:
         if isinstance(self.localizer, MeshLocalizer) and self._scan is None and (silent or self._fresh_scan):
             self._fresh_scan = False
             localizer = self.localizer
-            self._believed.update(self._belief.tracks if self._belief is not None else ())
+            self._believe()
             found = self._guard("localization", lambda: localizer.update_depth(frame), None)
             if found is not None:
                 self._status["localization"] = found.status
@@ -315,6 +328,24 @@ class PerceptionStack:
         )
         self._status["tracking"] = result.status
         return result
+
+    def _articulated(self, frame: RgbdFrame, T_map_camera: Float64, covariance: Float64) -> tuple[JointEstimate, ...]:
+        tracker = self.articulation
+        if tracker is None:
+            return ()
+        kept = self._belief.joints if self._belief is not None else tracker.estimates(frame.stamp)
+
+        def work() -> tuple[JointEstimate, ...]:
+            return tracker.update(frame, T_map_camera, covariance, self._own_pixels(frame))
+
+        return self._guard("articulation", work, kept)
+
+    def _believe(self) -> None:
+        """Bring the scene of localization to what is believed now."""
+        if self._belief is not None:
+            self._believed.update(self._belief.tracks, self._belief.joints)
+        else:
+            self._believed.update(())
 
     def _settle_segmentation(self, now: int) -> Presegmentation | None:
         """Take up what has been segmented; the detector gets the image, with what nothing explains in it."""
@@ -383,8 +414,9 @@ class PerceptionStack:
         assert self._belief is not None
         b = self._belief
         return Belief(
-            b.stamp, b.localization, b.T_map_camera, b.tracks, None, b.lidar, b.relations, dict(self._status), {}
-        )
+            b.stamp, b.localization, b.T_map_camera, b.tracks, None, b.lidar, b.relations, dict(self._status), {},
+            b.joints,
+        )  # fmt: skip
 
     def _nothing(self, stamp: int) -> Belief:
         """A belief before any usable image."""

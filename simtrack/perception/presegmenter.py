@@ -6,7 +6,7 @@ answer carries the stamp of the image or scan that it is about.
 
 from collections.abc import Mapping, Sequence
 
-from simtrack.contracts import Bool, Float64, LidarScan, Presegmentation, RgbdFrame, Track
+from simtrack.contracts import Bool, Float64, JointEstimate, LidarScan, Presegmentation, RgbdFrame, Track
 from simtrack.perception.believed_scene import BelievedScene
 from simtrack.perception.beside import Beside, worker
 from simtrack.perception.self_filter import SelfFilter
@@ -43,7 +43,12 @@ class Presegmenter:
         self.scan = Beside[Presegmentation](self._thread, scan_time)
 
     def begin_image(
-        self, frame: RgbdFrame, T_map_camera: Float64, tracks: Sequence[Track], positions: Mapping[str, float]
+        self,
+        frame: RgbdFrame,
+        T_map_camera: Float64,
+        tracks: Sequence[Track],
+        positions: Mapping[str, float],
+        joints: Sequence[JointEstimate] = (),
     ) -> None:
         """Begin with a depth image, as believed at its stamp.
 
@@ -51,18 +56,25 @@ class Presegmenter:
             frame: the image.
             T_map_camera: (4, 4).
             tracks: what stands before the map.
-            positions: joint name -> rad or m.
+            positions: joint name of the robot -> rad or m.
+            joints: how far the map's doors and drawers are open.
         """
 
         def work() -> Presegmentation:
-            self._believed.update(tracks)
+            self._believed.update(tracks, joints)
             own = self._body.camera_mask(frame, positions)
             return presegment_camera(frame, T_map_camera, self._believed.scene, own, self._config)
 
         self.image.begin(frame.stamp, work)
 
     def begin_scan(
-        self, stamp: int, scan: LidarScan, poses: Mapping[int, Float64], tracks: Sequence[Track], own: Bool
+        self,
+        stamp: int,
+        scan: LidarScan,
+        poses: Mapping[int, Float64],
+        tracks: Sequence[Track],
+        own: Bool,
+        joints: Sequence[JointEstimate] = (),
     ) -> None:
         """Begin with a scan at `stamp`, nanoseconds.
 
@@ -72,10 +84,11 @@ class Presegmenter:
             poses: (4, 4) T_map_base at the stamps of `presegmentation.shot_stamps`.
             tracks: what stands before the map.
             own: (N,), True where the robot sees itself.
+            joints: how far the map's doors and drawers are open.
         """
 
         def work() -> Presegmentation:
-            self._believed.update(tracks)
+            self._believed.update(tracks, joints)
             return presegment_lidar(scan, poses.__getitem__, self._believed.scene, own, self._config)
 
         self.scan.begin(stamp, work)

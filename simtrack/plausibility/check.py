@@ -206,15 +206,19 @@ def _engine_findings(result: EngineResult, config: CheckConfig) -> list[Finding]
         message = f"is {1e3 * depth:.1f} mm deep in '{second}'; both are fixed to each other and cannot give way"
         out.append(Finding("warning", "overlap", first, message))
     for joint in result.joints:
-        free = f"{100.0 * joint.reached:.0f} % of its range"
+        free, own = (f"{100.0 * share:.0f} % of its range" for share in (joint.reached, joint.reached_alone))
         met = f"meets '{joint.blocked_by}', {1e3 * joint.depth:.0f} mm deep"
         texts = {
             "drives-into-body": f"drives '{joint.body}' into its own body: {met}",
-            "unreachable": f"can only move through {free}: it {met}",
+            "unreachable": f"its own object leaves it {own}: it {met}",
             "astray": f"leads '{joint.body}' {1e3 * joint.follows:.1f} mm away from where its axis says",
         }
         out += [Finding("problem", problem, joint.name, texts[problem]) for problem in joint.problems]
-        if not joint.problems and joint.blocked_by is not None:
+        if joint.problems or joint.blocked_by is None:
+            continue
+        if joint.reached < config.least_range:  # no fault of the object: so are real rooms, too
+            out.append(Finding("warning", "obstructed", joint.name, f"has room for {free} only: it {met}"))
+        else:
             out.append(Finding("note", "blocked", joint.name, f"moves through {free}, then {met}"))
     return out
 

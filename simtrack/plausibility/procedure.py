@@ -214,60 +214,83 @@ def _sweep_joint(engine: Engine, body: Body, rest: dict[frozenset[str], float], 
     tree, joint = engine.tree, body.joint
     assert joint is not None
     lower, upper = (-np.pi, np.pi) if joint.kind == "continuous" else (joint.lower, joint.upper)
-    moved = tree.below(body.name)
+    moved, mechanism = tree.below(body.name), tree.mechanism(body.name)
     groups = tree.rigid_groups()
     own = {name for name, group in groups.items() if group == groups[joint.parent]}
-    free = {part.bodies[0].name for part in tree.components if not part.static}
-    loose = {body.name for part in tree.components if part.name in free for body in part.bodies} - moved - own
+    loose = {each.name for part in tree.components if not part.static for each in part.bodies} - moved - own
     positions = np.linspace(lower, upper, config.sweep_steps)
     start = min(max(0.0, lower), upper)
     # outwards from the rest position, so that the first collision on each side bounds what can be reached
     order = [positions[positions >= start], positions[positions < start][::-1]]
-    depth, follows, problems, blocker = 0.0, 0.0, [], None
-    reachable = 0.0
+    met: dict[str, float] = {}
+    follows, reachable, alone, drives = 0.0, 0.0, 0.0, False
     for side, end in zip(order, (upper, lower), strict=True):
-        last = start
-        blocked = False
+        way, way_alone = _Way(start), _Way(start)
         for position in side:
             engine.place({joint.name: float(position)})
             described = tree.forward({joint.name: float(position)})[body.name]
             follows = max(follows, _distance(engine.poses()[body.name], described, body))
-            entered = []
-            for pair in engine.proximities(0.0, moved):
-                if (pair.body_a in moved) == (pair.body_b in moved):
-                    continue
-                other = pair.body_b if pair.body_a in moved else pair.body_a
-                excess = -pair.distance - max(0.0, rest.get(_key(pair), 0.0))
-                if excess > config.sweep_penetration and other not in loose:
-                    entered.append((excess, other))
-            if entered:
-                worst, other = max(entered)
-                depth = max(depth, worst)
-                blocker = blocker or other
-                if {name for _, name in entered} & own and "drives-into-body" not in problems:
-                    problems.append("drives-into-body")
-                blocked = True
-            elif not blocked:
-                last = float(position)
-        reachable += abs((last if blocked else end) - start)
+            entered = _entered(engine, moved, loose, rest, config.sweep_penetration)
+            for name, depth in sorted(entered.items(), key=lambda item: -item[1]):
+                met[name] = max(met.get(name, 0.0), depth)
+            drives = drives or not own.isdisjoint(entered)
+            way.passes(float(position), not entered)
+            way_alone.passes(float(position), mechanism.isdisjoint(entered))
+        reachable += way.length(end)
+        alone += way_alone.length(end)
     engine.reset()
     span = upper - lower
-    reached = min(1.0, reachable / span) if span > 0.0 else 1.0
-    if reached < config.least_range:
-        problems.append("unreachable")
-    if follows > ASTRAY:
-        problems.append("astray")
+    reached, reached_alone = (min(1.0, part / span) if span > 0.0 else 1.0 for part in (reachable, alone))
+    problems = {
+        "drives-into-body": drives,
+        "unreachable": reached_alone < config.least_range,
+        "astray": follows > ASTRAY,
+    }
     return JointResult(
         name=joint.name,
         body=body.name,
         lower=float(lower),
         upper=float(upper),
         reached=float(reached),
-        blocked_by=blocker,
-        depth=float(depth),
+        reached_alone=float(reached_alone),
+        blocked_by=next(iter(met), None),
+        depth=float(max(met.values(), default=0.0)),
         follows=float(follows),
-        problems=tuple(problems),
+        problems=tuple(problem for problem, found in problems.items() if found),
     )
+
+
+class _Way:
+    """How far a joint goes to one side before it is blocked."""
+
+    def __init__(self, start: float) -> None:
+        self.start = self.last = start
+        self.blocked = False
+
+    def passes(self, position: float, free: bool) -> None:
+        """The next position outwards, and whether it can be taken."""
+        self.blocked = self.blocked or not free
+        if not self.blocked:
+            self.last = position
+
+    def length(self, end: float) -> float:
+        """Radians or metres of the way to the end of the range that are free."""
+        return abs((self.last if self.blocked else end) - self.start)
+
+
+def _entered(
+    engine: Engine, moved: frozenset[str], loose: set[str], rest: dict[frozenset[str], float], least: float
+) -> dict[str, float]:
+    """Bodies that what is moved has entered -> metres beyond the overlap at rest; those that are loose give way."""
+    entered: dict[str, float] = {}
+    for pair in engine.proximities(0.0, moved):
+        if (pair.body_a in moved) == (pair.body_b in moved):
+            continue
+        other = pair.body_b if pair.body_a in moved else pair.body_a
+        excess = -pair.distance - max(0.0, rest.get(_key(pair), 0.0))
+        if excess > least and other not in loose:
+            entered[other] = max(excess, entered.get(other, 0.0))
+    return entered
 
 
 def _distance(T_a: Float64, T_b: Float64, body: Body) -> float:

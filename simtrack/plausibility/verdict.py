@@ -35,7 +35,7 @@ class CheckConfig:
     sweep_penetration: float = 0.01
     """Metres that a moved part may enter others beyond what it does at rest."""
     least_range: float = 0.1
-    """Share of its range that a joint must be able to reach before it meets something."""
+    """Share of its range that a joint must be able to reach before it meets a part of its own object."""
 
     def __post_init__(self) -> None:
         for name in ("duration", "drift", "tilt", "toppled", "penetration", "gap", "sweep_penetration"):
@@ -94,6 +94,8 @@ class JointResult:
     upper: float
     reached: float
     """Share of the range that is free of collision, going out from the rest position; 1 for all of it."""
+    reached_alone: float
+    """The same if nothing stood there but the object that the joint belongs to."""
     blocked_by: str | None
     """First body that the moved part enters."""
     depth: float

@@ -108,6 +108,10 @@ def _from_tree(kind: Any, node: Any, archive: zipfile.ZipFile, where: str) -> An
             raise ArchiveError(f"{where}: {len(entries)} entries, expected {len(kinds)}")
         pairs = zip(kinds, entries, strict=True)
         return tuple(_from_tree(kind, entry, archive, f"{where}[{i}]") for i, (kind, entry) in enumerate(pairs))
+    if origin is typing.Literal:
+        if node not in arguments:
+            raise ArchiveError(f"{where}: {node!r}, expected one of {', '.join(map(repr, arguments))}")
+        return node
     if isinstance(kind, type) and issubclass(kind, Enum):
         try:
             return kind(node)

@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -12,7 +12,7 @@ from simtrack.errors import UnknownNameError
 from simtrack.geometry.transforms import apply, difference, inverse
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 from simtrack.simulation.contacts import SUPPORTING, contact_pairs
-from simtrack.simulation.history import KEY_NS, History
+from simtrack.simulation.history import History
 from simtrack.simulation.world import SENSOR_BODIES, World, body_pose
 from simtrack.simulation.world_rays import WorldRays
 
@@ -57,6 +57,8 @@ class Truth:
     """(supported, supporter): touches it from above; supporters are objects or furniture."""
     touching: frozenset[tuple[str, str]]
     """Pairs in alphabetical order that touch anyhow."""
+    joints: Mapping[str, float] = field(default_factory=dict)
+    """Positions of the building's doors and drawers, rad or m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,10 @@ class GroundTruth:
         self._scratch = mujoco.MjData(world.model)
         self._sensors = {frame: world.model.body(body).id for frame, body in SENSOR_BODIES.items()}
         self._movable = {name: body for name, body in world.bodies.items() if name != "robot"}
-        self._contacts = _ContactLog(world)
+        self._joints = {
+            moving.part.name: int(world.model.joint(moving.joint).qposadr[0]) for moving in world.static.moving
+        }
+        self._contacts = _ContactLog(world, history.key)
         self._alone: RayScene | None = None
         self._lidar: dict[int, Int32] = {}
         self._full: RayBundle | None = None
@@ -109,8 +114,8 @@ class GroundTruth:
     def at(self, stamp: int) -> Truth:
         """Everything at a stamp."""
         scratch = self._scratch
-        early = max(self._history.start, stamp - KEY_NS)
-        late = min(self._history.end, stamp + KEY_NS)
+        early = max(self._history.start, stamp - self._history.key)
+        late = min(self._history.end, stamp + self._history.key)
         around = []
         for moment in (early, late):
             self._history.load(moment, scratch)
@@ -127,7 +132,8 @@ class GroundTruth:
         contacts, touching = self._contacts.at(stamp)
         base = body_pose(scratch, self._world.bodies["robot"])
         camera, lidar = (body_pose(scratch, self._sensors[frame]) for frame in ("camera", "lidar"))
-        return Truth(stamp, base, camera, lidar, objects, contacts, touching)
+        joints = {name: float(scratch.qpos[address]) for name, address in self._joints.items()}
+        return Truth(stamp, base, camera, lidar, objects, contacts, touching, joints)
 
     def joint_positions(self, stamp: int) -> dict[str, float]:
         """True positions of the robot's joints, rad or m."""
@@ -277,9 +283,9 @@ class GroundTruth:
 class _ContactLog:
     """Contacts between things, kept only where they change."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, key: int) -> None:
         names = world.names
-        self._names = names
+        self._names, self._key = names, key
         robot = [k for k, name in enumerate(names) if name == "robot"]
         self._owner = np.where(np.isin(world.geom_owners, robot), -1, world.geom_owners)
         self._is_object = np.array([name in world.objects for name in names])
@@ -296,7 +302,7 @@ class _ContactLog:
 
     def append(self, data: "mujoco.MjData") -> None:
         contact = data.contact
-        stamp, self._count = self._count * KEY_NS, self._count + 1
+        stamp, self._count = self._count * self._key, self._count + 1
         geoms, apart, up = contact.geom, contact.dist > 0.0, contact.frame[:, 2]
         asleep = data.tree_asleep >= 0
         fingerprint = geoms.tobytes() + apart.tobytes() + (np.abs(up) > SUPPORTING).tobytes() + asleep.tobytes()

@@ -1,6 +1,7 @@
 """What the hand does: picks, carries, puts down and pushes objects as the scene's script says."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -17,8 +18,8 @@ from simtrack.simulation.world import HAND_BITS, TIMESTEP_NS, World, body_pose
 if TYPE_CHECKING:
     import mujoco
 
-Motion: TypeAlias = Iterator[HandPose]
-"""One pose for each physics step."""
+Motion: TypeAlias = Iterator[HandPose | Callable[[], HandPose]]
+"""One pose for each physics step, or how it is worked out if it is wanted."""
 
 DT = TIMESTEP_NS * 1e-9
 PEAK = 1.875
@@ -66,7 +67,8 @@ class HandDirector:
                     self._area(action.to)
                 except SimtrackError as error:
                     raise FileFormatError(world.scene.path, f"hand.script.{k}.to", str(error)) from error
-        self._mocap = [int(self._model.body(name).mocapid[0]) for name in hand.PARTS]
+        mocap = [int(self._model.body(name).mocapid[0]) for name in hand.PARTS]
+        self._mocap = slice(mocap[0], mocap[-1] + 1)  # one after the other: they are made together
         self._contacts = [g for g in range(self._model.ngeom) if self._model.geom(g).name.startswith("hand/contact")]
         self._faces = [
             Area(part.T_map_part @ T, (0.0, 0.0), (0.0, 0.0), np.asarray(size, dtype=float))
@@ -90,7 +92,7 @@ class HandDirector:
         """Move the hand on by so many physics steps."""
         for _ in range(steps - 1):
             next(self._motion)
-        pose = next(self._motion)
+        pose = _made(next(self._motion))
         if pose is not self._pose:
             self._pose = pose
             self._apply(data)
@@ -130,9 +132,13 @@ class HandDirector:
         seconds = max(PEAK * way / speed, PEAK * turn / rate, PEAK * abs(opening - start.opening) / 0.3, DT)
         steps = int(np.ceil(seconds / DT))
         course = difference(T, start.T_map_hand)
+
+        def pose(share: float) -> HandPose:
+            s = minimum_jerk(share)
+            return HandPose(perturb(start.T_map_hand, s * course), start.opening + s * (opening - start.opening))
+
         for k in range(1, steps + 1):
-            s = minimum_jerk(k / steps)
-            yield HandPose(perturb(start.T_map_hand, s * course), start.opening + s * (opening - start.opening))
+            yield partial(pose, k / steps)
 
     # ------------------------------------------------------------------------------------------------------------ carry
 
@@ -164,7 +170,8 @@ class HandDirector:
 
     def _put_down(self, T: Float64, opening: float, name: str) -> Motion:
         """Down until the thing touches something, then hold still for a moment."""
-        for pose in self._move(T, opening, GENTLE):
+        for course in self._move(T, opening, GENTLE):
+            pose = _made(course)
             yield pose
             if pose.T_map_hand[2, 3] - T[2, 3] < 0.03 and self._touches(name):
                 break
@@ -235,10 +242,14 @@ class HandDirector:
         spin = float(np.max(slope * np.hypot(turn, tilting)))
         seconds = max(PEAK * way / action.speed, spin / max(action.turn_rate, 0.1), 0.4)
         steps = int(np.ceil(seconds / DT))
-        for k in range(1, steps + 1):
-            s = minimum_jerk(k / steps)
+
+        def pose(share: float) -> HandPose:
+            s = minimum_jerk(share)
             R = exp_so3(tilt * np.sin(np.pi * s) ** 2 * axis) @ _yawed(s * turn) @ start[:3, :3]
-            yield HandPose(transform(R, start[:3, 3] + s * (T[:3, 3] - start[:3, 3])), opening)
+            return HandPose(transform(R, start[:3, 3] + s * (T[:3, 3] - start[:3, 3])), opening)
+
+        for k in range(1, steps + 1):
+            yield partial(pose, k / steps)
 
     # ------------------------------------------------------------------------------------------------------------- push
 
@@ -324,6 +335,10 @@ class HandDirector:
     def _touch(self, on: bool) -> None:
         """Let the fingers make contact, for pushes only: a grip is a weld, not a squeeze."""
         self._model.geom_contype[self._contacts] = HAND_BITS[0] if on else 0
+
+
+def _made(pose: HandPose | Callable[[], HandPose]) -> HandPose:
+    return pose if isinstance(pose, HandPose) else pose()
 
 
 def _yawed(yaw: float) -> Float64:

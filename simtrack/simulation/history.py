@@ -23,11 +23,12 @@ class History:
     many nanoseconds are kept at least, and older keys are forgotten.
     """
 
-    def __init__(self, model: "mujoco.MjModel", memory: int | None = None) -> None:
+    def __init__(self, model: "mujoco.MjModel", memory: int | None = None, key: int = KEY_NS) -> None:
+        """`memory`: nanoseconds of the past that are kept, all of it if None; `key`: nanoseconds between keys."""
         import mujoco
 
-        self._model = model
-        self._keep = None if memory is None else -(-memory // KEY_NS) + 2
+        self._model, self.key = model, key
+        self._keep = None if memory is None else -(-memory // key) + 2
         free = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE] + 3
         ball = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_BALL]
         quaternions = np.concatenate([free, ball]).astype(np.int64)
@@ -44,12 +45,12 @@ class History:
     @property
     def start(self) -> int:
         """Stamp of the first key that is still known, nanoseconds."""
-        return self._forgotten * KEY_NS
+        return self._forgotten * self.key
 
     @property
     def end(self) -> int:
         """Stamp of the last key, nanoseconds."""
-        return (self._forgotten + self._count - 1) * KEY_NS
+        return (self._forgotten + self._count - 1) * self.key
 
     def clear(self) -> None:
         """Forget everything: the next key is that of stamp 0."""
@@ -86,8 +87,8 @@ class History:
         """
         if not self.start <= stamp <= self.end:
             raise InvalidValueError("stamp", stamp, f"{self.start} to {self.end} ns, what was simulated so far")
-        index = min(int(stamp // KEY_NS) - self._forgotten, max(self._count - 2, 0))
-        fraction = (stamp - self.start - index * KEY_NS) / KEY_NS
+        index = min(int(stamp // self.key) - self._forgotten, max(self._count - 2, 0))
+        fraction = (stamp - self.start - index * self.key) / self.key
         if fraction == 0.0:
             return self._rows[index].copy()
         row = (1.0 - fraction) * self._rows[index] + fraction * self._rows[index + 1]

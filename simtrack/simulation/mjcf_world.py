@@ -6,7 +6,7 @@ becomes that object.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,11 @@ from simtrack.contracts import Float64, Room
 from simtrack.errors import FileFormatError
 from simtrack.geometry.meshes import Mesh, concatenate, face_areas, face_normals, transformed
 from simtrack.geometry.planes import detect_planes
-from simtrack.geometry.transforms import inverse, rotation_from_quaternion, rpy_from_rotation, transform
+from simtrack.geometry.transforms import apply, inverse, rotation_from_quaternion, rpy_from_rotation, transform
 from simtrack.geometry.upright_boxes import upright_box
 from simtrack.objects import load_object
 from simtrack.objects.registry import catalogue
-from simtrack.simulation.building.parts import StaticPart, StaticWorld, polygon_area, room_at
+from simtrack.simulation.building.parts import MovingPart, StaticPart, StaticWorld, Support, polygon_area, room_at
 from simtrack.simulation.placement import blocking
 from simtrack.simulation.scene_file import SceneFile, parse_scene
 from simtrack.simulation.user_mjcf import geom_shape, read_model
@@ -37,6 +37,8 @@ LEAST_SUPPORT = 0.01
 """Square metres of a face that things stand on."""
 VIEW = 1.3
 """Metres between the robot and what it looks at first."""
+SURVEYED = 0.6
+"""Metres: free bodies that are larger, and those with doors, are furniture, and surveyed where they stand."""
 TRIES = 2000
 
 
@@ -65,15 +67,32 @@ def mjcf_scene(path: Path) -> SceneFile:
     return parse_scene(document, path)
 
 
-def mjcf_building(scene: SceneFile) -> StaticWorld:
-    """What is fixed in a scene's MJCF file, its floor at height 0.
+def mjcf_building(scene: SceneFile, *, supports: bool = True) -> StaticWorld:
+    """What is fixed in a scene's MJCF file, its floor at height 0; `supports`: with the faces that things stand on.
 
     Raises:
         FileFormatError: the scene names no MJCF file, or that cannot be used as a building.
     """
     if scene.mjcf_path is None:
         raise FileFormatError(scene.path, "mjcf", "missing; the builder 'mjcf' makes the building of this file")
-    return _Reading(scene.mjcf_path, scene.path.parent).building()
+    return _Reading(scene.mjcf_path, scene.path.parent).building(supports=supports)
+
+
+def level_faces(part: StaticPart) -> tuple[Support, ...]:
+    """Rectangles around the level planes of a part that look up, part frame."""
+    return tuple(_supports(part.mesh, np.eye(4)))
+
+
+def free_bodies(scene: SceneFile) -> dict[str, Float64]:
+    """Name of each free body that is no known object -> (2, 3) bounds of what is seen of it, map frame."""
+    assert scene.mjcf_path is not None
+    reading = _Reading(scene.mjcf_path, scene.path.parent)
+    known = {body for body, _ in reading.known_objects()}
+    return {
+        reading.name(body): mesh.bounds - (0.0, 0.0, reading.floor[1])
+        for body, mesh in reading.surfaces.items()
+        if reading.is_free(body) and body not in known
+    }
 
 
 def floor_height(scene: SceneFile) -> float:
@@ -158,27 +177,67 @@ class _Reading:
     def building(self, *, supports: bool = True) -> StaticWorld:
         """All that is fixed, one part a body, and the room that the floor is of; `supports`: with faces to stand on."""
         lowered = transform(None, (0.0, 0.0, -self.floor[1]))
-        parts = []
+        movers = {body: self._mover(body) for body in self.surfaces}
+        bearers = {int(self.model.body_rootid[mover]) for mover in movers.values() if mover}
+        parts, moving = [], []
         for body, mesh in self.surfaces.items():
-            if self.is_free(body):
+            bears = int(self.model.body_rootid[body]) in bearers
+            if self.is_free(body) and not bears and mesh.extents.max() < SURVEYED:
                 continue
-            low, high = mesh.bounds
-            T_map_part = lowered @ transform(None, (low + high) / 2)
-            T_part_file = inverse(T_map_part) @ lowered
-            semantic_class = FLOOR if body == self.floor[0] else self.classes.get(self.name(body), "furniture")
-            parts.append(
-                StaticPart(
-                    name=self.name(body),
-                    semantic_class=semantic_class,
-                    mesh=transformed(mesh, T_part_file),
-                    T_map_part=T_map_part,
-                    extents=high - low,
-                    supports=tuple(_supports(mesh, T_part_file)) if supports else (),
-                    room="room",
-                    collision=tuple(self._boxes(body, T_part_file)),
-                )
-            )
-        return StaticWorld(tuple(parts), (self._room(),))
+            if not movers[body]:
+                parts.append(self._part(body, mesh, lowered, supports=supports))
+            elif movers[body] == body and not self._mover(int(self.model.body_parentid[body])):
+                moving.append(self._moving(body, movers, lowered))
+        return StaticWorld(tuple(parts), (self._room(),), tuple(moving))
+
+    def _mover(self, body: int) -> int:
+        """The body nearest to the root, from this one up, that a hinge or a slide moves; 0 if nothing does."""
+        import mujoco
+
+        found = 0
+        while body:
+            first, count = int(self.model.body_jntadr[body]), int(self.model.body_jntnum[body])
+            if any(self.model.jnt_type[first : first + count] != mujoco.mjtJoint.mjJNT_FREE):
+                found = body
+            body = int(self.model.body_parentid[body])
+        return found
+
+    def _part(self, body: int, mesh: Mesh, lowered: Float64, *, supports: bool) -> StaticPart:
+        low, high = mesh.bounds
+        T_map_part = lowered @ transform(None, (low + high) / 2)
+        T_part_file = inverse(T_map_part) @ lowered
+        return StaticPart(
+            name=self.name(body),
+            semantic_class=FLOOR if body == self.floor[0] else self.classes.get(self.name(body), "furniture"),
+            mesh=transformed(mesh, T_part_file),
+            T_map_part=T_map_part,
+            extents=high - low,
+            supports=tuple(_supports(mesh, T_part_file)) if supports else (),
+            room="room",
+            collision=tuple(self._boxes(body, T_part_file)),
+        )
+
+    def _moving(self, body: int, movers: Mapping[int, int], lowered: Float64) -> MovingPart:
+        """A door or drawer with all that hangs on it; of several joints of one body the first."""
+        import mujoco
+
+        from simtrack.simulation.user_mjcf import PREFIX
+
+        joint = int(self.model.body_jntadr[body])
+        mesh = concatenate([shape for other, shape in self.surfaces.items() if movers[other] == body])
+        slides = self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+        limited, bounds = bool(self.model.jnt_limited[joint]), self.model.jnt_range[joint]
+        lower, upper = bounds.tolist() if limited else (-1.0, 1.0) if slides else (-np.pi, np.pi)
+        return MovingPart(
+            part=self._part(body, mesh, lowered, supports=False),
+            joint=PREFIX + self.model.joint(joint).name,
+            body=PREFIX + self.name(body),
+            kind="prismatic" if slides else "revolute",
+            anchor=apply(lowered, self.data.xanchor[joint][None])[0],
+            axis=self.data.xaxis[joint].copy(),
+            lower=float(lower),
+            upper=float(upper),
+        )
 
     def _boxes(self, body: int, T_part_file: Float64) -> Iterator[tuple[Float64, Float64]]:
         """Boxes around what a body collides with."""
@@ -225,6 +284,6 @@ def _start(path: Path, world: StaticWorld, objects: Float64) -> tuple[float, flo
     tried = rng.uniform(outline.min(axis=0), outline.max(axis=0), (TRIES, 2))
     order = np.argsort(np.abs(np.linalg.norm(tried - aim, axis=1) - VIEW))
     for x, y in tried[order].tolist():
-        if room_at(world.rooms, x, y) is not None and blocking(world.parts, x, y) is None:
+        if room_at(world.rooms, x, y) is not None and blocking(world.solid, x, y) is None:
             return x, y, float(np.arctan2(aim[1] - y, aim[0] - x))
     raise FileFormatError(path, "worldbody", "there is no free place on the floor for the robot, 0.6 m across")

@@ -202,7 +202,7 @@ def start_pose(scene: SceneFile, world: StaticWorld, rng: np.random.Generator) -
         pose = _facing(scene, start, world, rng)
     else:
         pose = _in_room(scene, start, world, rng)
-    blocker = blocking(world.parts, pose[0], pose[1])
+    blocker = blocking(world.solid, pose[0], pose[1])
     if blocker is not None:
         raise FileFormatError(scene.path, "robot.start", f"the robot would stand in '{blocker}'")
     return pose
@@ -222,7 +222,7 @@ def _facing(
         position = apply(part.T_map_part, np.array([[x, rng.uniform(*start.lateral), 0.0]]))[0]
         yaw = float(np.arctan2(-front[1], -front[0]) + rng.uniform(*start.yaw))
         pose = (float(position[0]), float(position[1]), yaw)
-        if blocking(world.parts, pose[0], pose[1]) is None:
+        if blocking(world.solid, pose[0], pose[1]) is None:
             break
     return pose
 
@@ -237,7 +237,7 @@ def _in_room(
     low, high = room.polygon.min(axis=0), room.polygon.max(axis=0)
     for _ in range(50 * TRIES):
         x, y = (float(value) for value in rng.uniform(low, high))
-        if room_at([room], x, y) is not None and blocking(world.parts, x, y) is None:
+        if room_at([room], x, y) is not None and blocking(world.solid, x, y) is None:
             return x, y, float(rng.uniform(-np.pi, np.pi))
     raise FileFormatError(scene.path, "robot.start.room", f"found no free floor in room '{start.room}'")
 

@@ -225,7 +225,13 @@ def ray_image(
         shape: (H, W).
         out: hits of an earlier image, to be overwritten.
     """
-    hits = rays.scene.cast(bundle, T_map_camera, np.inf, min_distance=NEAR, out=out)
+    return shaded(
+        rays, bundle, T_map_camera, shape, rays.scene.cast(bundle, T_map_camera, np.inf, min_distance=NEAR, out=out)
+    )
+
+
+def shaded(rays: WorldRays, bundle: RayBundle, T_map_camera: Float64, shape: tuple[int, int], hits: RayHits) -> Uint8:
+    """As `ray_image`, of rays that have been cast."""
     sun = np.array([0.25, 0.35, -1.0]) / np.linalg.norm([0.25, 0.35, -1.0])
     view = bundle.directions @ T_map_camera[:3, :3].T.astype(np.float32)
     view /= np.linalg.norm(view, axis=1, keepdims=True)
@@ -247,27 +253,33 @@ class EmbreeRenderer:
         self._bundle = RayBundle.from_camera(intrinsics)
         self._shape = (intrinsics.height, intrinsics.width)
         self._hits = RayHits.empty(len(self._bundle))
+        self._moment = b""
+        """What `_hits` are of: where everything was, the camera last."""
 
     def depth(self, data: "mujoco.MjData") -> Float32:
         """See `Renderer`."""
-        distances = self._cast(data, self._far).distances
-        return np.where(np.isfinite(distances), distances, np.float32(0.0)).reshape(self._shape)
+        distances = self._cast(data)[0].distances
+        return np.where(distances <= self._far, distances, np.float32(0.0)).reshape(self._shape)
 
     def ids(self, data: "mujoco.MjData") -> Int32:
         """See `Renderer`."""
-        return self._rays.ids(self._cast(data, self._far)).reshape(self._shape)
+        hits, _ = self._cast(data)
+        return np.where(hits.distances <= self._far, self._rays.ids(hits), -1).astype(np.int32).reshape(self._shape)
 
     def rgb(self, data: "mujoco.MjData") -> Uint8:
         """See `Renderer`."""
-        self._rays.place(data)
-        return ray_image(self._rays, self._bundle, self._pose(data), self._shape, self._hits)
+        hits, T_map_camera = self._cast(data)
+        return shaded(self._rays, self._bundle, T_map_camera, self._shape, hits)
 
-    def _cast(self, data: "mujoco.MjData", far: float) -> RayHits:
-        self._rays.place(data)
-        return self._rays.scene.cast(self._bundle, self._pose(data), far, min_distance=NEAR, out=self._hits)
-
-    def _pose(self, data: "mujoco.MjData") -> Float64:
-        return transform(data.xmat[self._body].reshape(3, 3), data.xpos[self._body])
+    def _cast(self, data: "mujoco.MjData") -> tuple[RayHits, Float64]:
+        """What the pixels meet, at any distance, and the camera's pose; images of one moment share one cast."""
+        T_map_camera = transform(data.xmat[self._body].reshape(3, 3), data.xpos[self._body])
+        moment = self._rays.poses(data).tobytes() + T_map_camera.tobytes()
+        if moment != self._moment:
+            self._rays.place(data)
+            self._rays.scene.cast(self._bundle, T_map_camera, min_distance=NEAR, out=self._hits)
+            self._moment = moment
+        return self._hits, T_map_camera
 
     def close(self) -> None:
         """See `Renderer`; the ray scene belongs to whoever made it."""

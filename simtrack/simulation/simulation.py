@@ -73,6 +73,7 @@ class Simulation:
         proprioception: int = PROPRIOCEPTION_NS,
         scan_key: int = KEY_NS,
         servo: int = TIMESTEP_NS,
+        key: int = KEY_NS,
     ) -> None:
         """Build the world of `scene` for `seed` and let it settle; stamp 0 is the moment after.
 
@@ -88,6 +89,7 @@ class Simulation:
             proprioception: nanoseconds between odometry readings and between joint states.
             scan_key: nanoseconds between the moments of a lidar's turn that its motion is interpolated from.
             servo: nanoseconds between the setpoints of robot and hand: a physics step, or two.
+            key: nanoseconds between the states that are remembered; those in between are interpolated.
 
         Raises:
             SimtrackError: whatever is wrong with the scene; see `build_world`.
@@ -96,6 +98,8 @@ class Simulation:
 
         if servo not in (TIMESTEP_NS, KEY_NS):
             raise InvalidValueError("servo", servo, f"{TIMESTEP_NS} or {KEY_NS} ns")
+        if key < KEY_NS or key % KEY_NS:
+            raise InvalidValueError("key", key, f"a multiple of {KEY_NS} ns")
         if unknown := sorted(set(sensors) - set(SENSORS)):
             raise UnknownNameError("sensor", unknown[0], SENSORS)
         self.scene, self.seed = scene, seed
@@ -109,7 +113,7 @@ class Simulation:
         self._scratch = mujoco.MjData(self.world.model)
         self._scan_scratch = mujoco.MjData(self.world.model)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="simtrack-sensors")
-        self._history = History(self.world.model, memory)
+        self._history = History(self.world.model, memory, key)
         self._rays = WorldRays(self.world)
         self.truth = GroundTruth(self.world, self._history, self._rays, intrinsics)
         self._renderer = make_renderer(renderer, self.world, self._rays, intrinsics, FAR)
@@ -295,7 +299,7 @@ class Simulation:
         import mujoco
 
         steps = self._servo // TIMESTEP_NS
-        for _ in range(KEY_NS // self._servo):
+        for _ in range(self._history.key // self._servo):
             self.world.controller.step(self._data, command)
             if self._hand is not None:
                 self._hand.step(self._data, steps)

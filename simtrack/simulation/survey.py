@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from simtrack.contracts import Float64, MapEntity, StaticMap
+from simtrack.contracts import Articulation, Float64, MapEntity, StaticMap
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.meshes import (
     Mesh,
@@ -92,13 +92,36 @@ def survey(world: StaticWorld, config: SurveyConfig | None = None, rng: np.rando
 
     Returns:
         The mesh with an entity for every part that was surveyed, at its surveyed place. No vertex is shared with the
-        world (unless `noise` is 0, where outlines coincide). Kept in the user's cache folder, by content.
+        world (unless `noise` is 0, where outlines coincide). Kept in the user's cache folder, by content. What joints
+        let move is no part of the mesh.
     """
     config = SurveyConfig() if config is None else config
     rng = np.random.default_rng(0) if rng is None else rng
     seed = int(rng.integers(2**63))
     key = world_digest(world, seed, config)
-    return cached_map(key, lambda: _surveyed(world, config, np.random.default_rng(seed)))
+    static_map = cached_map(key, lambda: _surveyed(world, config, np.random.default_rng(seed)))
+    return replace(static_map, articulations=_articulations(world, config, np.random.default_rng([seed, 1])))
+
+
+def _articulations(world: StaticWorld, config: SurveyConfig, rng: np.random.Generator) -> tuple[Articulation, ...]:
+    """Doors and drawers as surveyed, each by itself: their surfaces and axes are off as the rest of the map is."""
+    surveyed = []
+    for moving in world.moving:
+        mesh = _displaced(_scanned(moving.part, config.edge or 0.2, rng), config, rng)
+        surveyed.append(
+            Articulation(
+                name=moving.part.name,
+                semantic_class=moving.part.semantic_class,
+                kind=moving.kind,
+                anchor=moving.anchor + rng.normal(0.0, config.noise, 3),
+                axis=moving.axis,
+                lower=moving.lower,
+                upper=moving.upper,
+                vertices=mesh.vertices.astype(np.float32),
+                faces=mesh.faces,
+            )
+        )
+    return tuple(surveyed)
 
 
 def _surveyed(world: StaticWorld, config: SurveyConfig, rng: np.random.Generator) -> StaticMap:

@@ -66,7 +66,7 @@ def read_model(path: Path, folder: Path, without: Collection[str] = ()) -> "tupl
     Args:
         path: the file.
         folder: in which all files that it names must lie.
-        without: names of bodies that are left out.
+        without: names of bodies that are left out, if there are such.
 
     Raises:
         FileFormatError: see `attach`.
@@ -79,7 +79,8 @@ def read_model(path: Path, folder: Path, without: Collection[str] = ()) -> "tupl
         for number, body in enumerate(user.bodies[1:]):
             body.name = body.name or f"body{number}"
         for name in without:
-            user.delete(user.body(name))
+            if (body := user.body(name)) is not None:
+                user.delete(body)
         return user, user.compile()
     except ValueError as error:
         raise FileFormatError(path, "", f"MuJoCo cannot use it: {error}") from error

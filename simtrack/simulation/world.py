@@ -192,7 +192,7 @@ def build_world(
         _add_object(composer, name, model, poses[name], "catalogue" if trackable else "clutter")
     _add_robot(composer, robot, fovy)
     if scene.robot.suction:
-        _add_suction(composer, models)
+        _add_suction(composer, models, static)
     if scene.hand is not None:
         _add_hand(composer, scene)
     world = _assembled(scene, seed, composer, static, robot, models)
@@ -366,14 +366,19 @@ def _add_robot(composer: _Composer, robot: KinematicTree, fovy: float) -> None:
     camera.fovy = float(np.degrees(fovy))
 
 
-def _add_suction(composer: _Composer, models: Mapping[str, ObjectModel]) -> None:
-    """A constraint for each object that ties it to the gripper while the cup holds it."""
+def _add_suction(composer: _Composer, models: Mapping[str, ObjectModel], static: StaticWorld) -> None:
+    """A constraint for each object, door and drawer that ties it to the gripper while the cup holds it."""
     import mujoco
 
     for name in models:
         composer.spec.add_equality(
             name=f"suction/{name}", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY,
             name1=ROBOT + GRIPPER, name2=f"object/{name}", active=False, solref=[0.012, 1.0],
+        )  # fmt: skip
+    for moving in static.moving:  # what hangs on a joint of its own turns under the cup
+        composer.spec.add_equality(
+            name=f"suction/{moving.part.name}", type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1=ROBOT + GRIPPER, name2=moving.body, active=False, solref=[0.02, 1.0],
         )  # fmt: skip
 
 

@@ -74,11 +74,12 @@ class WorldRays:
 
     def move(self, keys: Sequence[Float64]) -> None:
         """Let everything move through keys (K of (I, 4, 4), see `poses`) during ray time 0 to 1."""
-        for number, track in enumerate(np.stack(keys, axis=1), self._first):
-            if np.abs(track - track[0]).max() < STILL:
-                self.scene.set_pose(number, track[0])
-            else:
-                self.scene.set_motion(number, track)
+        tracks = np.stack(keys, axis=1)
+        still = np.abs(tracks - tracks[:, :1]).max(axis=(1, 2, 3)) < STILL
+        numbers = np.arange(self._first, self._first + len(tracks))
+        self.scene.set_poses(numbers[still].tolist(), tracks[still, 0])
+        for number, track in zip(numbers[~still].tolist(), tracks[~still], strict=True):
+            self.scene.set_motion(number, track)
 
     def ids(self, hits: RayHits) -> Int32:
         """(N,) index into `World.names` of what each ray hit, -1 = nothing."""

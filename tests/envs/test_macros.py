@@ -39,7 +39,7 @@ def simulation() -> Iterator[Simulation]:
 
 @pytest.fixture
 def table(simulation: Simulation) -> tuple[Simulation, Manipulator]:
-    simulation.restart(0)
+    simulation.restart(1)
     return simulation, Manipulator(simulation)
 
 
@@ -85,6 +85,23 @@ def test_what_cannot_be_done_is_told_and_not_tried(table: tuple[Simulation, Mani
     hand.grasp(far, load_object("relay"), base)
     assert run(simulation, hand) is Outcome.OUT_OF_REACH
     assert hand.cup.touching() is None
+
+
+def test_what_sleeps_follows_the_cup_that_holds_it(
+    table: tuple[Simulation, Manipulator], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulation, hand = table
+    for _ in range(10):
+        simulation.advance(STILL)
+    world, before = simulation.world, pose(simulation, "relay")
+    assert world.data.tree_asleep[world.model.body_treeid[world.bodies["relay"]]] >= 0
+    monkeypatch.setattr(hand.cup, "touching", lambda: "relay")
+    assert hand.cup.close() == "relay"
+    world.controller.reach({"arm_1_joint": -0.8})
+    for _ in range(10):
+        simulation.advance(STILL)
+    assert np.linalg.norm(pose(simulation, "relay")[:3, 3] - before[:3, 3]) > 0.02
+    hand.cup.open()
 
 
 def test_a_robot_without_a_cup_cannot_grasp() -> None:

@@ -1,3 +1,4 @@
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import cast
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from simtrack.envs.actions import MOVES
+from simtrack.envs.bop_recorder import BopRecorder
 from simtrack.envs.environment import SimtrackEnv
 from simtrack.envs.observations import Arrays
 from simtrack.envs.wrappers import DiscreteActions, FlatBelief, Recorder, Video
@@ -85,3 +87,28 @@ def test_an_episode_becomes_a_log_that_can_be_read(make: Make, tmp_path: Path) -
 def test_without_a_camera_there_is_nothing_to_record(make: Make, tmp_path: Path) -> None:
     with pytest.raises(InvalidValueError, match="rgbd"):
         Recorder(make(observation="state"), tmp_path)
+
+
+def test_episodes_become_a_data_set_that_shows_what_was_true(make: Make, tmp_path: Path) -> None:
+    env = BopRecorder(make(observation="rgbd", seconds=0.3), tmp_path / "new", every=3)
+    truths = []
+    for seed in (0, 1):
+        _, info = env.reset(seed=seed)
+        truths.append(info["truth"])
+        for _ in range(3):
+            env.step(np.zeros(5, np.float32))
+    env.close()
+    split = tmp_path / "new" / "bop" / "train_pbr"
+    for scene, truth in enumerate(truths):
+        folder = split / f"{scene:06d}"
+        assert len(list((folder / "rgb").iterdir())) == 2
+        poses = json.loads((folder / "scene_gt.json").read_text())["0"]
+        camera = json.loads((folder / "scene_camera.json").read_text())["0"]
+        R_w2c, t_w2c = np.reshape(camera["cam_R_w2c"], (3, 3)), np.array(camera["cam_t_w2c"])
+        found = sorted(tuple(R_w2c.T @ (np.array(p["cam_t_m2c"]) - t_w2c) / 1e3) for p in poses)
+        wanted = sorted(tuple(T[:3, 3]) for T in truth["poses"])
+        np.testing.assert_allclose(found, wanted, atol=1e-3)
+    with pytest.raises(InvalidValueError, match="empty"):
+        BopRecorder(make(observation="rgbd"), tmp_path / "new")
+    with pytest.raises(InvalidValueError, match="rgbd"):
+        BopRecorder(make(observation="state"), tmp_path / "other")

@@ -12,6 +12,7 @@ from simtrack.evaluation import reconstruction_rooms
 from simtrack.evaluation.cad_errors import chamfer_distance, rotation_error, symmetries
 from simtrack.evaluation.reconstruction import (
     BodyOutcome,
+    JointOutcome,
     ModelOutcome,
     RoomOutcome,
     outcome_from_json,
@@ -40,6 +41,7 @@ def room(name: str = "rooms:1", entities: str = "true", **changes: object) -> Ro
         wrong_support=("cup1",), missing=("book1", "book2"), extra=(), general=6, leaning=(2, 1, 1),
         models=(model("chair1"), model("chair2", seen=0.4, yaw=1.0, height=1.3)),
         bodies=(BodyOutcome("chair1", True, 0.001, 0.002), BodyOutcome("chair2", False, 0.003, None)),
+        joints=(JointOutcome("door", True, 1.0, 0.05), JointOutcome("drawer", False, 1.0, 1.0)),
         verdict="not plausible", problems=("problem: chair2: fell",), margin=0.001, agreement=0.5,
         graph_seconds=1.0, seconds=10.0, cpu_seconds=9.0,
     )  # fmt: skip
@@ -89,6 +91,8 @@ def test_figures_are_those_of_the_rooms() -> None:
     assert figures["cad.seen_30_to_60.height"] == 0.0
     assert figures["cad.seen_0_to_30.yaw"] is None
     assert (figures["physics.stable_scenes"], figures["physics.stable_bodies"]) == (0.5, 0.75)
+    joints = [figures[f"physics.joints.{name}"] for name in ("full_range", "can_open", "free")]
+    assert joints == [0.5, 0.0, 0.5], "the first is sound but obstructed, the other one is not sound"
     assert figures["physics.agreement"] == pytest.approx(0.75), "each body counts the same"
     unchecked = summary([replace(room(), verdict="not checked", bodies=())])
     assert not any(name.startswith("physics") for name in unchecked)

@@ -1,15 +1,16 @@
 """Policies that come along. They see observations and what an agent may know before it starts, never the truth."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from simtrack.contracts import Command, Float32, StaticMap
+from simtrack.contracts import Command, Float32, Relation, StaticMap
 from simtrack.errors import InvalidValueError, UnknownNameError
 from simtrack.geometry.kinematics import KinematicTree
+from simtrack.objects import ObjectModel
 
 if TYPE_CHECKING:
     from simtrack.envs.observations import Layout
@@ -28,6 +29,10 @@ class Briefing:
     """What the arrays of an observation stand for."""
     modes: tuple[str, ...]
     """Observation modes; with more than one, an observation is a mapping by mode."""
+    models: Mapping[str, ObjectModel]
+    """Class name -> model, as the tracker has it."""
+    goals: tuple[Relation, ...]
+    """What shall hold, between classes of objects and furniture."""
 
     def arrays(self, observation: Any, mode: str) -> dict[str, np.ndarray]:
         """The arrays of one mode; raises InvalidValueError if it is not observed."""
@@ -81,6 +86,8 @@ class StillPolicy:
 SCRIPTED = {
     "active-perception": "simtrack.envs.policies.agents:explorer",
     "localize": "simtrack.envs.policies.agents:tour",
+    "tidy": "simtrack.envs.policies.tidy:TidyPolicy",
+    "fetch-meal": "simtrack.envs.policies.fetch_meal:FetchMealPolicy",
 }
 """Task -> function that makes its scripted policy from (briefing, mode)."""
 POLICIES = ("random", "still", "scripted")

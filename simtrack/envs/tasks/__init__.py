@@ -10,6 +10,8 @@ from simtrack.errors import InvalidValueError, UnknownNameError
 TASKS = {
     "active-perception": "simtrack.envs.tasks.active_perception:ActivePerception",
     "localize": "simtrack.envs.tasks.localize:Localize",
+    "tidy": "simtrack.envs.tasks.tidy:Tidy",
+    "fetch-meal": "simtrack.envs.tasks.fetch_meal:FetchMeal",
 }
 """Name -> where its class is."""
 

@@ -29,6 +29,7 @@ class ActivePerception(Task):
     """
 
     scene = "workbench"
+    script = "active-perception"
     seconds = 30.0
 
     def prepare(self, simulation: "Simulation") -> None:

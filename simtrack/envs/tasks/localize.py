@@ -37,6 +37,7 @@ class Localize(Task):
     """
 
     scene = "lab_floor"
+    script = "localize"
     seconds = 40.0
 
     def adapt(self, scene: SceneFile) -> SceneFile:

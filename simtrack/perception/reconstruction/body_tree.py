@@ -283,6 +283,14 @@ class BodyTree:
             group[body.name] = group[joint.parent] if joint is not None and tied else body.name
         return group
 
+    def mechanism(self, name: str) -> frozenset[str]:
+        """Bodies of the object that a body is a part of: what fixed joints and moving ones tie together."""
+        rigid, top = self.rigid_groups(), dict[str, str]()
+        for body in self.bodies:
+            tied = body.joint is not None and (body.joint.moves or rigid[body.name] != body.name)
+            top[body.name] = top[body.joint.parent] if body.joint is not None and tied else body.name
+        return frozenset(other for other in top if top[other] == top[name])
+
 
 def standing_on(ground: Body, tree: BodyTree, T_ground_root: Float64) -> BodyTree:
     """The tree with `ground` as its new, static root, on which the old root rests freely."""

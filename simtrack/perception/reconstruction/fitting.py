@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from simtrack.contracts import Bool, Float64
+from simtrack.geometry.meshes import area
 from simtrack.geometry.transforms import transform
 from simtrack.perception.reconstruction.alignment import (
     AlignmentConfig,
@@ -75,6 +76,12 @@ class EntityView:
     def diagonal(self) -> float:
         """Of the box, metres."""
         return float(np.linalg.norm(self.extents))
+
+    @cached_property
+    def area(self) -> float:
+        """Of the seen surface, square metres."""
+        assert self.node.shape is not None
+        return area(self.node.shape.mesh)
 
     @cached_property
     def facing_sides(self) -> Float64:

@@ -5,7 +5,7 @@ kept and scaled with alpha. Supporting edges become fixed joints of what a hand 
 rest. The zero of every joint is where it was seen, so that the scene at rest is the scene that was seen.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from simtrack.objects.cad.model import CadJoint, CadPart
 from simtrack.perception.reconstruction.body_tree import Body, BodyJoint, BodyTree, JointKind, Shape
 from simtrack.perception.reconstruction.candidates import CadCandidate
 from simtrack.perception.reconstruction.layout import layout_mesh, layout_slabs
-from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_far_above, is_layout
 from simtrack.perception.scene_graph.contact.nodes import SCENE
 
 FIXED_CLASSES = frozenset(
@@ -39,6 +39,7 @@ def kinematic_tree(
     chosen: Mapping[str, CadCandidate],
     ground: float | None = None,
     parts: Mapping[str, str] | None = None,
+    resting: Collection[str] = (),
 ) -> BodyTree:
     """The tree of a scene.
 
@@ -48,6 +49,7 @@ def kinematic_tree(
         chosen: entity -> its aligned model, for all entities but layout.
         ground: height in metres of a level ground that nobody saw; none if None.
         parts: entity -> part of its supporter's model that it stands on; the base if it is not told.
+        resting: entities that rest on something, though the support that the graph guesses is far below.
     """
     of_entity = body_names(graph)
     taken = {*of_entity.values(), GROUND}
@@ -73,11 +75,11 @@ def kinematic_tree(
         grounded = ground is not None and graph.supports[entity].kind is SupportKind.ROOT
         if grounded:
             parent = bodies[1].name
-        kind: JointKind = "floating" if is_free(graph, entity, candidate, grounded=grounded) else "fixed"
+        kind: JointKind = "floating" if _floats(graph, entity, candidate, grounded, resting) else "fixed"
         T_map_base = np.asarray(candidate.T_map_model, float)
         parent = links.get((graph.supports[entity].parent, (parts or {}).get(entity, "")), parent)
         joint = BodyJoint(f"{body_name}/{kind}", kind, parent, inverse(poses[parent]) @ T_map_base)
-        made = _bodies_of(candidate, body_name, joint, node.semantic_class, taken)
+        made = bodies_of(candidate, body_name, joint, node.semantic_class, taken)
         bodies += made
         for part, body in zip(_parts_in_order(candidate), made, strict=True):
             assert body.joint is not None
@@ -90,6 +92,13 @@ def body_names(graph: ContactGraph) -> dict[str, str]:
     """Entity -> the body in the tree that is all of it, or its base; the scene node's is the root."""
     taken = {ROOT, GROUND}
     return {SCENE: ROOT} | {entity: _unique(_printable(entity), taken) for entity in graph.descendants()}
+
+
+def _floats(
+    graph: ContactGraph, entity: str, candidate: CadCandidate, grounded: bool, resting: Collection[str]
+) -> bool:
+    held = is_far_above(graph.nodes[entity], graph.supports[entity]) and entity not in resting
+    return not held and is_free(graph, entity, candidate, grounded=grounded)
 
 
 def is_free(graph: ContactGraph, entity: str, candidate: CadCandidate, *, grounded: bool = False) -> bool:
@@ -109,13 +118,11 @@ def scaled_mass(candidate: CadCandidate) -> float:
 
 
 def _parts_in_order(candidate: CadCandidate) -> list[str]:
-    """Names of the parts as `_bodies_of` makes bodies of them."""
+    """Names of the parts as `bodies_of` makes bodies of them."""
     return [candidate.model.parts[0].name, *(joint.child for joint in candidate.model.joints)]
 
 
-def _bodies_of(
-    candidate: CadCandidate, name: str, joint: BodyJoint, semantic_class: str, taken: set[str]
-) -> list[Body]:
+def bodies_of(candidate: CadCandidate, name: str, joint: BodyJoint, semantic_class: str, taken: set[str]) -> list[Body]:
     """Base and moving parts; the frame of a moving part is at the anchor of its joint."""
     model, scale = candidate.model, candidate.scale
     poses = model.part_poses(candidate.positions)

@@ -1,7 +1,7 @@
 """Floors, walls and ceilings as static bodies: their seen surface, and slabs that collide.
 
-A slab lies behind a plane, under the convex outline of what was seen on it: furniture hides much of floor and wall.
-Doors and windows are closed by it, as far as collisions are concerned.
+A slab lies behind a plane, under the convex outline of what was seen on it and of what stands on it: furniture hides
+much of floor and wall. Doors and windows are closed by it, as far as collisions are concerned.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from simtrack.contracts import Float64
 from simtrack.geometry.meshes import Mesh, convex_hull, decimate, transformed
 from simtrack.geometry.planes import SurfacePlane
 from simtrack.geometry.transforms import apply
-from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_layout
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
 from simtrack.perception.scene_graph.contact.nodes import EntityNode
 
 DEPTH = 0.1
@@ -48,7 +48,20 @@ def layout_slabs(graph: ContactGraph, name: str) -> tuple[Slab, ...]:
     towards = [k for k in range(len(outlines)) if float(node.planes[k].distance(middle[None])[0]) > 0.0]
     chosen = {s.plane for s in graph.supports.values() if s.parent == name and 0 <= s.plane < len(outlines)}
     chosen.add(max(towards or range(len(outlines)), key=lambda k: node.planes[k].area))
-    return tuple(_slab(node.planes[k], apply(node.T_map_entity, outlines[k])) for k in sorted(chosen))
+    return tuple(
+        _slab(node.planes[k], np.concatenate([apply(node.T_map_entity, outlines[k]), *_footprints(graph, name, k)]))
+        for k in sorted(chosen)
+    )
+
+
+def _footprints(graph: ContactGraph, name: str, plane: int) -> list[Float64]:
+    """(4, 3) bottoms of what stands on a plane: there it goes on, though it may not have been seen."""
+    children = [
+        s.child for s in graph.supports.values() if (s.parent, s.plane, s.kind) == (name, plane, SupportKind.ON)
+    ]
+    bottoms = [graph.nodes[child].box.corners[:4] for child in children]
+    surface = graph.nodes[name].planes[plane]
+    return [corners - surface.distance(corners)[:, None] * surface.normal for corners in bottoms]
 
 
 def _middle(graph: ContactGraph) -> Float64:

@@ -24,7 +24,7 @@ from simtrack.perception.reconstruction.own_model import is_own, own_candidate
 from simtrack.perception.reconstruction.selection import Rejection, Selection, SelectionConfig, select
 from simtrack.perception.reconstruction.settling import Settled, SettlingConfig, settle
 from simtrack.perception.reconstruction.snapping import Snapped, SnappingConfig, eq1_residuals, snap
-from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_layout
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_far_above, is_layout
 from simtrack.perception.scene_graph.contact.nodes import FLOOR, SCENE, EntityNode
 
 Shortlist = Callable[[EntityNode, ContactGraph, Sequence[CadModel]], Sequence[CadCandidate]]
@@ -58,6 +58,8 @@ class NoteCode(StrEnum):
     """No floor was seen: a level ground lies below the lowest entity."""
     HELD = "held"
     """Nothing supports it: it is fixed where it was seen."""
+    SHRUNK = "shrunk"
+    """Its model is smaller than it was seen to be, so that it fits between the others."""
     UNSTABLE = "unstable"
     """It would topple or slide far from where it was seen."""
 
@@ -81,10 +83,14 @@ class ReconstructionConfig:
     settling: SettlingConfig = field(default_factory=SettlingConfig)
     attempts: int = 4
     """Selections that are tried until everything comes to rest."""
+    shrunk: tuple[float, ...] = (0.95, 0.9)
+    """Factors by which models are made smaller one after the other that are in others all the same."""
 
     def __post_init__(self) -> None:
         if self.attempts < 1:
             raise InvalidValueError("ReconstructionConfig.attempts", self.attempts, "1 or more")
+        if not all(0.0 < factor <= 1.0 for factor in self.shrunk):
+            raise InvalidValueError("ReconstructionConfig.shrunk", self.shrunk, "factors in (0, 1]")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,11 +162,13 @@ def reconstruct(
     attempt = _settled_attempt(graph, shortlists, selection, ground, config, name)
     selection, snapped, chosen = attempt.selection, attempt.snapped, attempt.chosen
     _selection_notes(selection, notes)
+    _held_notes(graph, snapped, notes)
     _snapping_notes(graph, snapped, notes)
+    _shrinking_notes(attempt, shortlists, notes)
     _settling_notes(graph, attempt.settled, notes)
     placed = _settled(graph, snapped.candidates, attempt.settled)
     say("kinematic tree", 0.98)
-    tree = kinematic_tree(name, graph, placed, ground, snapped.parts)
+    tree = kinematic_tree(name, graph, placed, ground, snapped.parts, snapped.resting)
     residuals = eq1_residuals(graph, placed, config.snapping)
     choices = {
         entity: Choice(
@@ -203,11 +211,15 @@ def _settled_attempt(
     names = body_names(graph)
     barred: dict[str, set[int]] = {}
     attempts: list[_Attempt] = []
+
+    def attempt(selection: Selection, chosen: Mapping[str, CadCandidate]) -> _Attempt:
+        snapped = snap(graph, chosen, config.snapping, ground)
+        tree = kinematic_tree(name, graph, snapped.candidates, ground, snapped.parts, snapped.resting)
+        return _Attempt(selection, chosen, snapped, settle(tree, config.settling))
+
     for _ in range(config.attempts):
         chosen = {entity: shortlists[entity][rank] for entity, rank in selection.chosen.items()}
-        snapped = snap(graph, chosen, config.snapping, ground)
-        tree = kinematic_tree(name, graph, snapped.candidates, ground, snapped.parts)
-        attempts.append(_Attempt(selection, chosen, snapped, settle(tree, config.settling)))
+        attempts.append(attempt(selection, chosen))
         settled = attempts[-1].settled
         restless = [e for e in chosen if names[e] in settled.held or names[e] in settled.stuck]
         if not any(len(shortlists[entity]) > 1 for entity in restless):
@@ -215,7 +227,16 @@ def _settled_attempt(
         for entity in restless:
             barred.setdefault(entity, set()).add(selection.chosen[entity])
         selection = select(graph, shortlists, config.selection, barred)
-    return min(attempts, key=lambda attempt: attempt.unrest)
+    best = min(attempts, key=lambda made: made.unrest)
+    for factor in config.shrunk:
+        tight = [e for e in best.chosen if names[e] in best.settled.stuck and not is_own(best.chosen[e])]
+        if not tight:
+            break
+        smaller = {
+            e: replace(best.chosen[e], scale=factor * shortlists[e][best.selection.chosen[e]].scale) for e in tight
+        }
+        best = min(best, attempt(best.selection, {**best.chosen, **smaller}), key=lambda made: made.unrest)
+    return best
 
 
 def _settled(graph: ContactGraph, candidates: Mapping[str, CadCandidate], settled: Settled) -> dict[str, CadCandidate]:
@@ -242,6 +263,7 @@ def _shortlists(
 ) -> dict[str, Sequence[CadCandidate]]:
     """Candidates of every entity but layout, parents before children; its own mesh for what has none."""
     out: dict[str, Sequence[CadCandidate]] = {}
+    lacking: list[str] = []
     entities = [name for name in graph.descendants() if not is_layout(graph.nodes[name])]
     for number, name in enumerate(entities):
         say(f"matching {name}", 0.8 * number / len(entities))
@@ -256,10 +278,13 @@ def _shortlists(
                 notes.append(Note(NoteCode.NO_CANDIDATE, name, message))
         except UnknownNameError:
             found = ()
-            classes = ", ".join(cad_classes())
+            lacking.append(name)
             message = f"there is no model of the class '{node.semantic_class}'; its own mesh stands for it"
-            notes.append(Note(NoteCode.NO_MODEL, name, f"{message} (classes: {classes})"))
+            notes.append(Note(NoteCode.NO_MODEL, name, message))
         out[name] = found or _own(node, notes)
+    if lacking:
+        message = f"there are models of the classes {', '.join(cad_classes())}; see $SIMTRACK_CAD for more"
+        notes.append(Note(NoteCode.NO_MODEL, "", message))
     return out
 
 
@@ -297,6 +322,15 @@ def _own(node: EntityNode, notes: list[Note]) -> Sequence[CadCandidate]:
     return (candidate,)
 
 
+def _held_notes(graph: ContactGraph, snapped: Snapped, notes: list[Note]) -> None:
+    for name, support in graph.supports.items():
+        if is_far_above(graph.nodes[name], support) and name not in snapped.resting:
+            message = (
+                f"what holds it was not seen, and '{support.parent}' is too far below; it is fixed where it was seen"
+            )
+            notes.append(Note(NoteCode.HELD, name, message))
+
+
 def _selection_notes(selection: Selection, notes: list[Note]) -> None:
     for name, children in selection.lost.items():
         message = f"none of its candidates has room for all that it supports; too little is under {', '.join(children)}"
@@ -321,6 +355,16 @@ def _ground(graph: ContactGraph, chosen: Collection[str], notes: list[Note]) -> 
     message = f"no floor was seen: a level ground is put at z = {height:.3f} m, under {', '.join(loose)}"
     notes.append(Note(NoteCode.GROUND_INFERRED, "", message))
     return height
+
+
+def _shrinking_notes(attempt: _Attempt, shortlists: Mapping[str, Sequence[CadCandidate]], notes: list[Note]) -> None:
+    for name, rank in attempt.selection.chosen.items():
+        share = attempt.chosen[name].scale / shortlists[name][rank].scale
+        if share < 1.0:
+            message = (
+                f"is made {100.0 * (1.0 - share):.0f} % smaller than it was seen to be: it would not fit in its place"
+            )
+            notes.append(Note(NoteCode.SHRUNK, name, message))
 
 
 def _snapping_notes(graph: ContactGraph, snapped: Snapped, notes: list[Note]) -> None:

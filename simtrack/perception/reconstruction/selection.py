@@ -16,6 +16,7 @@ from simtrack.geometry.boxes import OrientedBox
 from simtrack.geometry.transforms import transform
 from simtrack.perception.reconstruction.candidates import CadCandidate, PlacedSupport
 from simtrack.perception.reconstruction.layout import layout_slabs
+from simtrack.perception.reconstruction.own_model import is_own
 from simtrack.perception.reconstruction.solids import Solid, depth_along, overlap, solid_of
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
 from simtrack.perception.scene_graph.contact.nodes import FLOOR
@@ -24,6 +25,8 @@ INNER = 0.8
 """Sides of the part of a child's box, about its middle, that has to be free: models are not exactly alike."""
 OVERHANG = 0.3
 """Share of its width by which the middle of what stands on a face stays away from the face's edge."""
+CLEAR = 0.9
+"""Share of its height that has to be free above a face: boards and drawers are thin, and take little of it."""
 MOST_TAKEN = 0.15
 """Share of it that the model may take."""
 
@@ -46,6 +49,10 @@ class SelectionConfig:
     """How far a candidate may stand in layout: snapping pushes it out."""
     overlap_depth: float = 0.01
     """How deep two candidates may be in each other: snapping pushes them apart."""
+    far_worse: float = 3.0
+    """Times the least alignment error among those that survive, above which a candidate is not taken."""
+    slack: float = 0.01
+    """Metres of alignment error that count for nothing in that."""
     steps: int = 200
     """Of the min-conflicts search."""
     seed: int = 0
@@ -55,7 +62,7 @@ class SelectionConfig:
         for name in ("contact_area", "weak_area"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"SelectionConfig.{name}", getattr(self, name), "a share in (0, 1]")
-        for name in ("height", "far", "aside", "wall_depth", "overlap_depth"):
+        for name in ("height", "far", "aside", "wall_depth", "overlap_depth", "far_worse", "slack"):
             if not 0.0 <= getattr(self, name) < np.inf:
                 raise InvalidValueError(f"SelectionConfig.{name}", getattr(self, name), "finite and >= 0")
         if self.steps < 0:
@@ -106,6 +113,7 @@ def select(
     solids = {name: [solid_of(candidate) for candidate in found] for name, found in shortlists.items() if found}
     layout = _upright_layout(graph)
     kept = {name: _kept(graph, name, shortlists[name], solids[name], layout, config, out) for name in solids}
+    kept = {name: _well_aligned(name, ranks, shortlists[name], config, out) for name, ranks in kept.items()}
     for name, ranks in (barred or {}).items():
         kept[name] = [rank for rank in kept[name] if rank not in ranks] or kept[name]
     _min_conflicts(graph, kept, solids, config, out)
@@ -168,6 +176,23 @@ def _kept(
     return ranks
 
 
+def _well_aligned(
+    name: str, ranks: Sequence[int], candidates: Sequence[CadCandidate], config: SelectionConfig, out: Selection
+) -> list[int]:
+    """Those of the ranks that are not far worse aligned than the best: a book on its edge does not lie down for a push.
+
+    Its own mesh counts as well aligned.
+    """
+    errors = {rank: 0.0 if is_own(candidates[rank]) else candidates[rank].alignment_error for rank in ranks}
+    models = [rank for rank in ranks if not is_own(candidates[rank])]
+    least = min((errors[rank] for rank in models), default=0.0)
+    good = [rank for rank in ranks if errors[rank] <= config.far_worse * least + config.slack]
+    for rank in set(ranks) - set(good):
+        reason = f"is aligned far worse, AE {1e3 * errors[rank]:.0f} mm and not {1e3 * least:.0f} mm"
+        out.rejected.setdefault(name, []).append(Rejection(rank, candidates[rank].model.name, reason))
+    return good
+
+
 def place_of(
     candidate: CadCandidate,
     solid: Solid,
@@ -222,7 +247,8 @@ def best_face(
             if np.linalg.norm(step) > aside:
                 continue
             moved = OrientedBox(transform(None, step) @ child.T_map_box, child.extents)
-        if contact_share(moved, face) >= least and _has_room(solid, moved, face.height):
+        low = face.clearance < CLEAR * child.extents[2]
+        if not low and contact_share(moved, face) >= least and _has_room(solid, moved, face.height):
             return face
     return None
 

@@ -20,12 +20,17 @@ from simtrack.geometry.upright_boxes import MIN_SIDE
 from simtrack.objects.cad import CadModel
 from simtrack.perception.reconstruction.alignment import AlignmentConfig
 from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.entity_frames import frames
 from simtrack.perception.reconstruction.fitting import SIDES, EntityView, Fit, coarse_fit, refined, with_open_joints
 from simtrack.perception.reconstruction.matching import UPRIGHT, MatchingConfig, matches
 from simtrack.perception.scene_graph.contact import ContactGraph, EntityKind, EntityNode
 
 _WALL_AREA = 0.5
 """Square metres of the planes that count as walls."""
+_UNSEEN_SIDES = 2
+"""Sides of the box that may not have been seen of what is believed to lie."""
+_FLAT = 0.3
+"""Or the share of its surface that is flat."""
 _SEEN_BOTTOM = 0.02
 """Share of the surface that faces down at the lower end of an entity whose bottom was seen."""
 
@@ -51,7 +56,8 @@ class ShortlistConfig:
     """Factor, added to 1, on the error of an articulated candidate whose front nobody saw where its rear was seen:
     rears stand against walls."""
     opened: int = 3
-    """Candidates of articulated models for which open positions of the joints are tried."""
+    """Candidates of articulated models for which open positions of the joints are tried; all of them where the smallest
+    box is not that of the carcass: something stands open."""
 
     def __post_init__(self) -> None:
         for name in ("upright", "tipped", "opened", "access", "unseen_front"):
@@ -84,20 +90,44 @@ def shortlist(
     config = config or ShortlistConfig()
     if not models or top < 1 or node.kind is EntityKind.LAYOUT or node.shape is None:
         return ()
-    node = on_its_bottom(node)
-    view = EntityView.of(node, graph, config.alignment.samples)
-    free = front_clearances(view, graph)
+    found: list[tuple[float, CadCandidate]] = []
+    framed = frames(on_its_bottom(node), graph)
+    openable = 0 if node.kind is not EntityKind.ARTICULATED else config.opened if len(framed) == 1 else top
+    for seen, T_back in framed:
+        view = EntityView.of(seen, graph, config.alignment.samples)
+        free = front_clearances(view, graph)
+        for fit in _fits(view, graph, models, free, config, top, openable):
+            error = view.diagonal * ranking_error(fit, view, free, config)
+            found.append((error, _candidate(view, fit, T_back)))
+    return tuple(candidate for _, candidate in sorted(found, key=lambda pair: pair[0])[:top])
+
+
+def _fits(
+    view: EntityView,
+    graph: ContactGraph,
+    models: Sequence[CadModel],
+    free: Float64,
+    config: ShortlistConfig,
+    top: int,
+    openable: int,
+) -> list[Fit]:
+    """The best aligned models in one frame, by rising error; of the first `openable` ones joints are tried open."""
+    ways = ((True, config.upright), (False, config.tipped)) if could_lie(view) else ((True, config.upright),)
     fits = [
         coarse_fit(view, match, config.alignment)
-        for upright, count in ((True, config.upright), (False, config.tipped))
-        for match in matches(node, graph, models, config.matching, count, upright=upright)
+        for upright, count in ways
+        for match in matches(view.node, graph, models, config.matching, count, upright=upright)
     ]
     ranked = _ranked(fits, view, free, config)[:top]
     ranked = _ranked([refined(view, fit, config.alignment) for fit in ranked], view, free, config)
-    if node.kind is EntityKind.ARTICULATED:
-        opened = [with_open_joints(view, fit, config.alignment) for fit in ranked[: config.opened]]
-        ranked = _ranked([*opened, *ranked[config.opened :]], view, free, config)
-    return tuple(_candidate(view, fit) for fit in ranked)
+    opened = [with_open_joints(view, fit, config.alignment) for fit in ranked[:openable]]
+    return _ranked([*opened, *ranked[openable:]], view, free, config)
+
+
+def could_lie(view: EntityView) -> bool:
+    """Whether enough was seen to believe that a thing does not stand as it is made to: sides of it, or faces."""
+    flat = sum(plane.area for plane in view.node.planes)
+    return bool(np.count_nonzero(view.open_sides) < _UNSEEN_SIDES or flat > _FLAT * view.area)
 
 
 def on_its_bottom(node: EntityNode) -> EntityNode:
@@ -167,10 +197,10 @@ def front_clearances(view: EntityView, graph: ContactGraph) -> Float64:
     return free
 
 
-def _candidate(view: EntityView, fit: Fit) -> CadCandidate:
+def _candidate(view: EntityView, fit: Fit, T_back: Float64) -> CadCandidate:
     return CadCandidate(
         model=fit.match.model,
-        T_map_model=view.node.box.T_map_box @ fit.T_box_model,
+        T_map_model=T_back @ view.node.box.T_map_box @ fit.T_box_model,
         scale=fit.scale,
         positions=dict(fit.surface.positions),
         matching_error=fit.match.error,

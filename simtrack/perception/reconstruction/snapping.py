@@ -20,7 +20,7 @@ from simtrack.perception.reconstruction.kinematic_tree import FIXED_CLASSES, sca
 from simtrack.perception.reconstruction.layout import layout_slabs
 from simtrack.perception.reconstruction.selection import best_face, step_onto
 from simtrack.perception.reconstruction.solids import Solid, compacted, resting_rise, solid_of
-from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_layout
+from simtrack.perception.scene_graph.contact.graph import ContactGraph, SupportKind, is_far_above, is_layout
 from simtrack.perception.scene_graph.contact.nodes import SCENE
 
 SLACK = 2e-4
@@ -47,11 +47,13 @@ class SnappingConfig:
     """How far a model may stand in what it stands on, at most half of its height; what is deeper in is beside it."""
     depth: float = 0.001
     """Interpenetration that is left alone."""
+    beside: float = 0.008
+    """Interpenetration of two things that are left in each other from which one of them is laid on the other one."""
     rounds: int = 40
     """Of pushing apart."""
 
     def __post_init__(self) -> None:
-        for name in ("reach", "aside", "sink", "depth"):
+        for name in ("reach", "aside", "sink", "depth", "beside"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"SnappingConfig.{name}", getattr(self, name), "a positive finite length")
         if self.rounds < 0:
@@ -72,6 +74,8 @@ class Snapped:
     """Entities below which there is nothing of their supporter."""
     stuck: list[tuple[str, str, float]] = field(default_factory=list)
     """Pairs that are still in each other, and how deep, metres."""
+    resting: frozenset[str] = frozenset()
+    """What is far above a support that is only guessed, but rests on something else."""
 
 
 def snap(
@@ -127,6 +131,7 @@ class _Snapping:
         self.start = _solids(graph, chosen)
         self.shifts = {name: np.zeros(3) for name in self.start}
         self.afloat: set[str] = set()
+        self.resting: set[str] = set()
         self.parts: dict[str, str] = {}
         self.faces: dict[str, tuple[str, PlacedSupport]] = {}
         """What each stands on: a face of its supporter as that was before it moved."""
@@ -144,6 +149,8 @@ class _Snapping:
                 if not any(self._push(contact) for contact in stuck):
                     break
                 self._stack()
+            for contact in self._deepest(scene.contacts(self.shifts)):
+                self._lay_on(contact)
             stuck = self._deepest(scene.contacts(self.shifts))
         candidates = {name: self._placed(name) for name in self.order}
         return Snapped(
@@ -152,6 +159,7 @@ class _Snapping:
             self.parts,
             sorted(self.afloat),
             [(c.first, c.second, c.depth) for c in stuck],
+            frozenset(self.resting),
         )
 
     # ---------------------------------------------------------------------------------------------------------- heights
@@ -168,6 +176,8 @@ class _Snapping:
             elif support.kind is SupportKind.ROOT:
                 if self.ground is not None:
                     self.shifts[name][2] += self.ground - self._solid(name).bottom
+            elif is_far_above(self.graph.nodes[name], support):
+                self._onto_whatever(name)
             else:
                 self._put_down(name, support.parent, support.height)
             self.rested[name] = self._against(name)
@@ -199,6 +209,16 @@ class _Snapping:
         if found is None:
             self.afloat.add(name)
         else:
+            self._shift(name, np.array([0.0, 0.0, found]))
+
+    def _onto_whatever(self, name: str) -> None:
+        """Rest on anything right below, though nobody saw that it stands on that."""
+        below = {
+            other: self._solid(other) for other in self.start if other not in (name, *self.graph.descendants(name))
+        }
+        found = resting_rise(self._solid(name), below, (-self.config.sink, self.config.sink))
+        if found is not None:
+            self.resting.add(name)
             self._shift(name, np.array([0.0, 0.0, found]))
 
     def _rise(self, name: str, solid: Solid, reach: float) -> float | None:
@@ -264,6 +284,21 @@ class _Snapping:
                 self._shift(name, part)
                 self._keep_on(name)
         return True
+
+    def _lay_on(self, contact: Contact) -> None:
+        """Where two things have no place beside each other, the higher or lighter one is laid on the other one."""
+        pair = [name for name in (contact.first, contact.second) if self._liftable(name)]
+        if contact.depth < self.config.beside or len(pair) < 2 or pair[0] in self._above(pair[1]):
+            return
+        if pair[1] in self._above(pair[0]):
+            return
+        lower, upper = sorted(pair, key=lambda name: (round(self._solid(name).bottom, 2), self.weight[name]))
+        rise = resting_rise(self._solid(upper), {lower: self._solid(lower)}, (0.0, self.config.reach))
+        if rise is not None:
+            self._shift(upper, np.array([0.0, 0.0, rise]))
+
+    def _liftable(self, name: str) -> bool:
+        return self.weight[name] > 0.0 and self.graph.nodes[name].semantic_class not in FIXED_CLASSES
 
     def _deepest(self, contacts: list[Contact]) -> list[Contact]:
         """The deepest contact of every pair of entities that is too deep."""

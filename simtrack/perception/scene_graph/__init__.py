@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from simtrack.perception.scene_graph.relations import (
         DIRECTIONS,
         RELATIONS,
+        MarginMeter,
         RelationConfig,
         relation_margin,
         relation_margins,
@@ -40,7 +41,7 @@ _HOME = {
     "graph": ("SceneGraph", "SceneGraphConfig"),
     "history": ("Event", "History", "Interval"),
     "query": ("Query", "parse_query"),
-    "relations": ("DIRECTIONS", "RELATIONS", "RelationConfig", "relation_margin", "relation_margins"),
+    "relations": ("DIRECTIONS", "RELATIONS", "MarginMeter", "RelationConfig", "relation_margin", "relation_margins"),
     "shapes": (
         "HeightField",
         "Interior",
@@ -65,6 +66,7 @@ __all__ = [
     "Interior",
     "Interval",
     "Layer",
+    "MarginMeter",
     "ModelLike",
     "Query",
     "RelationConfig",

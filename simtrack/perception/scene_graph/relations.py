@@ -22,6 +22,7 @@ from simtrack.geometry.boxes import OrientedBox
 from simtrack.perception.scene_graph import kernels
 from simtrack.perception.scene_graph.bodies import Body, BodyArrays
 from simtrack.perception.scene_graph.kernels import Parameters
+from simtrack.perception.scene_graph.shapes import Shape
 
 RELATIONS = (
     "on",
@@ -113,6 +114,23 @@ def relation_margins(
     pairs = np.stack(np.divmod(np.arange(n * n), max(n, 1)), axis=1)
     parameters = config.parameters(strict=strict, projection=projection)
     return kernels.margin_table(arrays.world, pairs, parameters).reshape(n, n, kernels.COUNT)
+
+
+class MarginMeter:
+    """The margin of one relation between two bodies, as `relation_margin` gives it, for many poses of theirs."""
+
+    def __init__(self, subject: Shape, name: str, reference: Shape, config: RelationConfig) -> None:
+        """Shapes and relation stay; raises UnknownNameError if `name` is no relation."""
+        if name not in RELATIONS:
+            raise UnknownNameError("relation", name, RELATIONS)
+        self._arrays = BodyArrays({"subject": subject, "reference": reference}, config, capacity=2)
+        self._slots = np.array([self._arrays.add(kind, np.eye(4)) for kind in ("subject", "reference")])
+        self._column, self._parameters = RELATIONS.index(name), config.parameters()
+
+    def margin(self, T_map_subject: Float64, T_map_reference: Float64) -> float:
+        """Metres, >= 0 where the relation holds; poses (4, 4)."""
+        self._arrays.set_poses(self._slots, np.stack([T_map_subject, T_map_reference]))
+        return float(kernels.margin_table(self._arrays.world, self._slots[None], self._parameters)[0, self._column])
 
 
 def relation_margin(

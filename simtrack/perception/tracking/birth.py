@@ -52,6 +52,8 @@ class FitConfig:
     """So many of the starts are gone on with after the first casts."""
     promising: float = 0.4
     """... unless it has even less support than this: nothing like the model is there."""
+    hopeless: float = 0.02
+    """Starts of which none has more support than this after the first casts, with their wide gates, are given up."""
     retry_angle: float = np.deg2rad(14.0)
     """How far those starts are turned, radians."""
     align_reach: float = 0.3
@@ -147,6 +149,8 @@ class Prober:
             for schedule, first in ((self._coarse, 2), (self._narrow, 1))
             if (result := self._register(T, depth, intrinsics, schedule[:first])) is not None
         ]
+        if not any(result.support > self._fit.hopeless for result, _ in rough):
+            return None
         rough.sort(key=lambda entry: cost(entry[0]))
         finer = [
             self._register(result.T_camera_object, depth, intrinsics, rest)

@@ -68,18 +68,44 @@ class StaticPart:
         return apply(self.T_map_part, np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]))[:, :2]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingPart:
+    """A piece that a joint lets move against the building: a door, a drawer."""
+
+    part: StaticPart
+    """As it stands with the joint at 0."""
+    joint: str
+    """Name of its joint in the compiled world."""
+    body: str
+    """Name of its body there."""
+    kind: Literal["revolute", "prismatic"]
+    anchor: Float64
+    """(3,), a point of the axis, map frame."""
+    axis: Float64
+    """(3,), unit vector, map frame."""
+    lower: float
+    """Radians or metres."""
+    upper: float
+
+
 @dataclass(frozen=True, eq=False)
 class StaticWorld:
     """A building as it really is: the simulator's truth. Estimators get a `StaticMap` from a survey of it instead."""
 
     parts: tuple[StaticPart, ...]
     rooms: tuple[Room, ...] = ()
+    moving: tuple[MovingPart, ...] = ()
 
     def __post_init__(self) -> None:
-        names = [part.name for part in self.parts]
+        names = [part.name for part in self.solid]
         repeated = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
         if repeated:
             raise InvalidValueError("StaticWorld.parts", repeated, "parts with names of their own")
+
+    @cached_property
+    def solid(self) -> tuple[StaticPart, ...]:
+        """All parts, those that joints move with their joints at 0."""
+        return (*self.parts, *(moving.part for moving in self.moving))
 
     @cached_property
     def triangles(self) -> int:

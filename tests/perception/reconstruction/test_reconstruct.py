@@ -5,13 +5,16 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from corner import FLOOR, block, corner, cupboard_model, graph_of, table_mesh, table_model
+from corner import FLOOR, at, block, corner, cupboard_model, graph_of, table_mesh, table_model
 
-from simtrack.geometry.meshes import Mesh, is_closed
+from simtrack.geometry.meshes import Mesh, concatenate, is_closed
 from simtrack.objects.cad import CadModel
+from simtrack.objects.cad.builder import ModelBuilder
+from simtrack.objects.cad.materials import OAK, STEEL
 from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.layout import layout_slabs
 from simtrack.perception.reconstruction.own_model import is_own, own_candidate
-from simtrack.perception.reconstruction.reconstruct import NoteCode, Reconstruction, reconstruct
+from simtrack.perception.reconstruction.reconstruct import NoteCode, Reconstruction, ReconstructionConfig, reconstruct
 from simtrack.perception.reconstruction.record import dump_reconstruction
 from simtrack.perception.scene_graph.contact import ContactGraph, EntityMesh, EntityNode, FindingCode
 
@@ -52,8 +55,11 @@ def test_what_has_no_model_is_its_own_mesh_and_that_is_said(laid: Reconstruction
     assert {note.entity: note.code for note in laid.notes} == {
         "gadget": NoteCode.NO_MODEL,
         "cup": NoteCode.NO_CANDIDATE,
+        "": NoteCode.NO_MODEL,
     }
-    assert "gadget" in next(note.message for note in laid.notes if note.code is NoteCode.NO_MODEL)
+    said = {note.entity: note.message for note in laid.notes}
+    assert "'gadget'" in said["gadget"]
+    assert "table" in said[""], "the classes that there are, said once"
 
 
 def test_the_record_tells_which_model_stands_where(laid: Reconstruction) -> None:
@@ -84,6 +90,52 @@ def test_entities_without_planes_and_empty_meshes_are_findings_and_the_rest_is_m
     assert codes["ghost"] is FindingCode.INVALID_ENTITY
     assert codes["ball"] is FindingCode.NO_PLANES
     assert set(made.choices) == {"ball"}
+
+
+def test_what_is_far_above_a_guessed_support_stays_where_it_was_seen() -> None:
+    """A book on a shelf that nobody saw; a table top whose legs nobody saw reaches down."""
+    top = block((1.0, 0.8, 0.03), (-1.5, 0.0, 0.7))
+    made = scene(book=("tome", block((0.2, 0.15, 0.03), (0.0, 0.0, 1.4))), top=("desk", top))
+    assert {name: made.graph.supports[name].touching for name in made.choices} == {"book": False, "top": False}
+    heights = {n: c.candidate.mesh().bounds[:, 2] for n, c in made.choices.items()}
+    np.testing.assert_allclose(heights["book"], (1.4, 1.43), atol=1e-3)
+    np.testing.assert_allclose(heights["top"], (0.0, 0.73), atol=3e-3)
+    joint = made.tree.by_name["book"].joint
+    assert joint is not None and joint.kind == "fixed"
+    assert [note.entity for note in made.notes if note.code is NoteCode.HELD] == ["book"]
+
+
+def test_a_model_that_does_not_fit_is_made_smaller_and_that_is_said() -> None:
+    """A tin between two boards that are 10 mm nearer to each other than its model is high."""
+    boards = [block((0.6, 0.4, 0.02), (0.0, 0.0, z)) for z in (0.0, 0.22)]
+    sides = [block((0.02, 0.4, 0.24), (x, 0.0, 0.0)) for x in (-0.29, 0.29)]
+    graph = corner(rack=("table", concatenate([*boards, *sides])), tin=("tin", block((0.1, 0.1, 0.19), (0, 0, 0.02))))
+    rack, tin = ModelBuilder("table", "two boards"), ModelBuilder("tin", "tin")
+    part = rack.part()
+    for low, high in (((-0.3, -0.2, 0.0), (0.3, 0.2, 0.02)), ((-0.3, -0.2, 0.22), (0.3, 0.2, 0.24)),
+                      ((-0.3, -0.2, 0.0), (-0.28, 0.2, 0.24)), ((0.28, -0.2, 0.0), (0.3, 0.2, 0.24))):  # fmt: skip
+        part.block(low, high, OAK)
+    rack.hollow(part, (-0.28, -0.2, 0.02), (0.28, 0.2, 0.22))
+    tin.part().block((-0.05, -0.05, 0.0), (0.05, 0.05, 0.21), STEEL)
+    candidates = {
+        "rack": [CadCandidate(rack.finish("rack"), at(0.0, 0.0, 0.12), 1.0)],
+        "tin": [CadCandidate(tin.finish("tin"), at(0.0, 0.0, 0.125), 1.0)],
+    }
+    made = reconstruct(graph, known=candidates)
+    assert made.choices["tin"].candidate.scale == pytest.approx(0.95)
+    assert [note.entity for note in made.notes if note.code is NoteCode.SHRUNK] == ["tin"]
+    assert NoteCode.INTERPENETRATING not in {note.code for note in made.notes if note.entity == "tin"}
+    kept = reconstruct(graph, ReconstructionConfig(shrunk=()), known=candidates)
+    assert kept.choices["tin"].candidate.scale == 1.0
+
+
+def test_the_floor_goes_on_under_what_stands_on_it() -> None:
+    part = EntityMesh("floor", "floor", block((2.0, 2.0, 0.02), (0.0, 0.0, -0.02)))
+    crate = EntityMesh("crate", "crate", block((0.5, 0.5, 0.4), (1.1, 0.0, 0.0)))
+    graph = graph_of([part, crate])
+    assert graph.parent("crate") == "floor"
+    (slab,) = layout_slabs(graph, "floor")
+    assert slab.mesh.bounds[1, 0] >= 1.35
 
 
 def test_where_no_model_has_a_place_for_what_is_inside_the_own_mesh_has() -> None:

@@ -4,8 +4,12 @@ import pytest
 from corner import at, block, corner, table_mesh, table_model
 
 from simtrack.errors import InvalidValueError
+from simtrack.geometry.meshes import concatenate
+from simtrack.objects.cad.builder import ModelBuilder
+from simtrack.objects.cad.materials import OAK
 from simtrack.perception.reconstruction.candidates import CadCandidate
-from simtrack.perception.reconstruction.selection import SelectionConfig, select
+from simtrack.perception.reconstruction.selection import SelectionConfig, place_of, select
+from simtrack.perception.reconstruction.solids import solid_of
 from simtrack.perception.scene_graph.contact import ContactGraph
 
 WIDE, NARROW = table_model("table-wide", (1.0, 0.6, 0.7)), table_model("table-narrow", (0.3, 0.6, 0.7))
@@ -74,6 +78,41 @@ def test_barred_candidates_are_taken_only_where_nothing_else_is_left() -> None:
     offered = {"table": [CadCandidate(WIDE, at(x, 0.0, 0.35), 1.0) for x in (0.0, 0.01)]}
     assert select(graph, offered, barred={"table": {0}}).chosen == {"table": 1}
     assert select(graph, offered, barred={"table": {0, 1}}).chosen == {"table": 0}
+
+
+def test_a_candidate_that_is_aligned_far_worse_is_not_taken_to_keep_out_of_others() -> None:
+    graph = corner(
+        first=("table", table_mesh((0.9, 0.6, 0.7), (-0.5, 0.0, 0.0))),
+        second=("table", table_mesh((0.9, 0.6, 0.7), (0.5, 0.0, 0.0))),
+    )
+    offered = {
+        "first": [CadCandidate(WIDE, at(x, 0.0, 0.35), 1.0, alignment_error=error)
+                  for x, error in ((-0.45, 0.01), (-0.55, 0.2))],
+        "second": [CadCandidate(WIDE, at(0.45, 0.0, 0.35), 1.0, alignment_error=0.01)],
+    }  # fmt: skip
+    selection = select(graph, offered)
+    assert selection.chosen == {"first": 0, "second": 0}
+    assert [(r.rank, "far worse" in r.reason) for r in selection.rejected["first"]] == [(1, True)]
+    assert select(graph, offered, SelectionConfig(far_worse=30.0)).chosen["first"] == 1
+
+
+def test_what_is_taller_than_the_room_above_a_board_has_no_place_there() -> None:
+    """The board above is thin: of the volume of a bottle it takes next to nothing."""
+    shelf = [block((0.6, 0.3, 0.01), (0.0, 0.0, z)) for z in (0.0, 0.2, 0.4)]
+    graph = corner(
+        shelf=("cabinet", concatenate([*shelf, block((0.6, 0.01, 0.41), (0.0, 0.15, 0.0))])),
+        cup=("cup", block((0.08, 0.08, 0.1), (0.0, -0.02, 0.01))),
+    )
+    assert graph.parent("cup") == "shelf"
+    for clearance, kept in ((0.19, [0]), (0.08, [])):
+        builder = ModelBuilder("cabinet", "boards")
+        part = builder.part()
+        for z in (0.0, 0.01 + clearance, 0.4):
+            part.block((-0.3, -0.15, z), (0.3, 0.15, z + 0.01), OAK)
+        builder.hollow(part, (-0.3, -0.15, 0.01), (0.3, 0.15, 0.01 + clearance))
+        candidate = CadCandidate(builder.finish("shelf-test"), at(0.0, 0.0, 0.205), 1.0)
+        place = place_of(candidate, solid_of(candidate), graph, "cup", 0.05, 0.5)
+        assert (place is not None) == bool(kept)
 
 
 @pytest.mark.parametrize("field", [{"contact_area": 0.0}, {"steps": -1}, {"height": float("nan")}])

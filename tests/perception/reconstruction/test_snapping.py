@@ -48,6 +48,45 @@ def test_heights_follow_the_models_from_the_floor_upwards() -> None:
     assert snapped.afloat == [] and snapped.stuck == []
 
 
+def test_what_has_no_place_beside_another_is_laid_on_it() -> None:
+    """Models are wider than what was seen: both do not fit on the stool."""
+    graph = corner(
+        stool=("table", block((0.3, 0.3, 0.5), (0.0, 0.0, 0.0))),
+        first=("box", block((0.13, 0.2, 0.05), (-0.07, 0.0, 0.5))),
+        second=("box", block((0.13, 0.2, 0.05), (0.07, 0.0, 0.5))),
+    )
+    wide = slab((0.25, 0.2, 0.05))
+    chosen = {
+        "stool": CadCandidate(slab((0.3, 0.3, 0.5)), at(0.0, 0.0, 0.25), 1.0),
+        "first": CadCandidate(wide, at(-0.06, 0.0, 0.525), 1.0),
+        "second": CadCandidate(wide, at(0.06, 0.0, 0.525), 1.0),
+    }
+    snapped = snap(graph, chosen)
+    assert snapped.stuck == []
+    bottoms = sorted(solid_of(snapped.candidates[name]).bottom for name in ("first", "second"))
+    assert bottoms == pytest.approx([0.5, 0.55], abs=1e-4)
+
+
+def test_what_is_far_above_its_guessed_support_rests_on_what_is_right_below() -> None:
+    """A book whose edge alone is on a post: the graph guesses the floor."""
+    graph = corner(
+        post=("box", block((0.04, 0.04, 1.4), (0.08, 0.0, 0.0))),
+        book=("book", block((0.2, 0.15, 0.03), (0.0, 0.0, 1.405))),
+        tome=("book", block((0.2, 0.15, 0.03), (1.0, 0.0, 1.405))),
+    )
+    assert (graph.parent("book"), graph.parent("tome")) == ("floor", "floor")
+    book = slab((0.2, 0.15, 0.03))
+    chosen = {
+        "post": CadCandidate(slab((0.04, 0.04, 1.4)), at(0.08, 0.0, 0.7), 1.0),
+        "book": CadCandidate(book, at(0.0, 0.0, 1.42), 1.0),
+        "tome": CadCandidate(book, at(1.0, 0.0, 1.42), 1.0),
+    }
+    snapped = snap(graph, chosen)
+    assert snapped.resting == {"book"}
+    bottoms = {name: solid_of(snapped.candidates[name]).bottom for name in ("book", "tome")}
+    assert bottoms == pytest.approx({"book": 1.4, "tome": 1.405}, abs=1e-6)
+
+
 def test_what_stands_on_a_model_is_carried_out_of_the_wall_with_it() -> None:
     graph = corner(
         table=("table", table_mesh((1.0, 0.6, 0.7), (0.0, 1.69, 0.0))),

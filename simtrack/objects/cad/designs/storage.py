@@ -150,6 +150,31 @@ def locker() -> ModelBuilder:
     return b
 
 
+def wall_unit() -> ModelBuilder:
+    """Hangs on a wall: one door before a glass shelf."""
+    b = ModelBuilder("cabinet", "wall unit with one door and a glass shelf")
+    p, x, y, h = b.part(), 0.26, 0.16, 0.6
+    carcass(p, (-x, x), (-y, y), (0.0, h), 0.016, GREY_BOARD)
+    p.block((-x + 0.016, -y + 0.03, 0.3), (x - 0.016, y - 0.016, 0.306), GLASS)
+    b.hollow(p, (-x + 0.016, -y, 0.016), (x - 0.016, y - 0.016, 0.3))
+    b.hollow(p, (-x + 0.016, -y + 0.03, 0.306), (x - 0.016, y - 0.016, h - 0.016))
+    b.support(p, (0.0, 0.0, h), (2 * x, 2 * y))
+    door(b, "door", (-x, x), (0.0, h), -y, "left", WHITE_BOARD, grip=(0.05, 0.2))
+    return b
+
+
+def wall_pair() -> ModelBuilder:
+    """Hangs on a wall: two doors before one hollow."""
+    b = ModelBuilder("cabinet", "wall cupboard with two doors")
+    p, x, y, h = b.part(), 0.4, 0.17, 0.55
+    carcass(p, (-x, x), (-y, y), (0.0, h), 0.018, OAK)
+    b.hollow(p, (-x + 0.018, -y, 0.018), (x - 0.018, y - 0.018, h - 0.018))
+    b.support(p, (0.0, 0.0, h), (2 * x, 2 * y))
+    door(b, "left-door", (-x, 0.0), (0.0, h), -y, "left", OAK, grip=(0.05, 0.2))
+    door(b, "right-door", (0.0, x), (0.0, h), -y, "right", OAK, grip=(0.05, 0.2))
+    return b
+
+
 # ------------------------------------------------------------------------------------------------------------ fridges
 
 
@@ -299,7 +324,7 @@ MICROWAVES = {
 }
 """Name -> design."""
 
-CABINETS = (wardrobe, chest, sideboard, bookcase, night_stand, filing, vitrine, locker)
+CABINETS = (wardrobe, chest, sideboard, bookcase, night_stand, filing, vitrine, locker, wall_unit, wall_pair)
 FRIDGES = (
     single_door,
     freezer_below,

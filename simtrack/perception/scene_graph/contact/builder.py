@@ -22,7 +22,13 @@ from simtrack.perception.scene_graph.contact.evidence import (
     Posed,
     pair_evidence,
 )
-from simtrack.perception.scene_graph.contact.graph import ContactGraph, ProximalEdge, Support, SupportKind
+from simtrack.perception.scene_graph.contact.graph import (
+    ContactGraph,
+    ProximalEdge,
+    Support,
+    SupportKind,
+    is_far_above,
+)
 from simtrack.perception.scene_graph.contact.leaning import find_leaning
 from simtrack.perception.scene_graph.contact.nodes import FLOOR, EntityNode, Finding, FindingCode
 from simtrack.perception.scene_graph.contact.proximity import box_overlap, interpenetration
@@ -211,13 +217,16 @@ def _levels(heights: dict[str, float], gap: float) -> list[list[str]]:
 def refine_boxes(nodes: dict[str, EntityNode], supports: dict[str, Support]) -> list[Finding]:
     """Stretch or cut every box down to its support plane, so that Eq. 1 holds exactly; changes `nodes`.
 
-    Tops stay where they were seen. Support planes come from meshes and not from boxes, so the order does not matter.
+    Tops stay where they were seen, and so does all of what is far above a support that is only guessed. Support planes
+    come from meshes and not from boxes, so the order does not matter.
     """
     findings = []
     for name, support in supports.items():
         if support.kind not in (SupportKind.ON, SupportKind.INSIDE):
             continue
         node = nodes[name]
+        if is_far_above(node, support):
+            continue
         if node.top - support.height < 10.0 * MIN_SIDE:
             message = f"its top at {node.top:.3f} m lies below its support plane at {support.height:.3f} m"
             findings.append(Finding(FindingCode.SUNK, name, f"{message}; its box was not refined"))

@@ -132,6 +132,19 @@ def eq1_distance(child: EntityNode, parent: EntityNode, support: Support) -> flo
     return float(centre[2] - (height + 0.5 * child.box.extents[2]))
 
 
+FAR_BELOW = 3.0
+"""Largest sides of a thing: what nobody saw reach down to a support farther below does not reach down to it."""
+
+
+def is_far_above(node: EntityNode, support: Support) -> bool:
+    """Whether a support is guessed, and so far below that something between them was not seen.
+
+    A table is as wide as it is high, and may have legs; a book on a shelf that nobody saw is not as high as the room.
+    """
+    guessed = support.kind in (SupportKind.ON, SupportKind.INSIDE) and not support.touching
+    return guessed and support.distance > FAR_BELOW * float(node.box.extents[:2].max())
+
+
 def is_layout(node: EntityNode) -> bool:
     """Whether a node is a floor, a ceiling or a wall."""
     return node.kind is EntityKind.LAYOUT

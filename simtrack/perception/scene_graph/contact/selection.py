@@ -129,7 +129,7 @@ def _choices(name: str, bodies: Mapping[str, Posed], evidence: Evidence, config:
     for parent, pair in found.items():
         if pair.within is not None:
             choices.append(_Choice(_Rank.WITHIN, _on(name, parent, pair, pair.within, config, touching=True)))
-        if pair.hang is not None and not choices and clearance > config.hang_clearance:
+        if pair.hang is not None and clearance > config.hang_clearance:
             choices += _hung(name, child, parent, pair, config)
     choices += [_Choice(_Rank.LIKELY, support) for support in likely]
     if not choices:

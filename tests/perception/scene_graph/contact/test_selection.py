@@ -13,7 +13,7 @@ from simtrack.perception.scene_graph.contact import (
     build_contact_graph,
     entity_nodes,
 )
-from simtrack.perception.scene_graph.contact.evidence import PairEvidence, Posed, SupportOption
+from simtrack.perception.scene_graph.contact.evidence import HangOption, PairEvidence, Posed, SupportOption
 from simtrack.perception.scene_graph.contact.selection import select_supports
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -31,6 +31,23 @@ def test_a_cycle_is_broken_at_its_weakest_support_and_said(nodes: list[EntityNod
         (FindingCode.UNSUPPORTED, "bowl"),
     ]
     assert "tome -> cup -> bowl -> tome" in findings[0].message
+
+
+def test_what_hangs_does_so_though_something_in_it_reaches_its_bottom(nodes: list[EntityNode]) -> None:
+    """A cup in a wall cabinet: its own bottom is right above the cabinet's, which seems to be balanced on it."""
+    bodies = {node.name: Posed(node) for node in nodes if node.name in ("cup", "picture", "wall")}
+    on_cup = SupportOption(0, 0.7, -0.02, 0.3, SQUARE)
+    in_case = SupportOption(0, 0.7, 0.0, 0.9, SQUARE)
+    evidence = {
+        ("picture", "wall"): PairEvidence(hang=HangOption(0, 0.0, 1.0, 0.1)),
+        ("picture", "cup"): PairEvidence(options=(on_cup,)),
+        ("cup", "picture"): PairEvidence(options=(in_case,)),
+    }
+    supports, _, findings = select_supports(bodies, evidence, ContactConfig())
+    assert {name: support.parent for name, support in supports.items()} == {
+        "cup": "picture", "picture": "wall", "wall": SCENE,
+    }  # fmt: skip
+    assert [(f.code, f.entity) for f in findings] == [(FindingCode.SUPPORT_CYCLE, "picture")]
 
 
 def test_a_book_across_two_thin_ones_lies_on_them_and_not_on_the_table() -> None:

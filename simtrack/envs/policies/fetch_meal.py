@@ -1,0 +1,406 @@
+"""Fetches a meal: opens what has to be open, takes the item, puts it in, closes. Sees beliefs and the survey only."""
+
+from collections.abc import Generator, Iterator
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from simtrack.contracts import NANOSECONDS, Articulation, Float32, Float64, JointEstimate, MapEntity, Track
+from simtrack.envs.actions import AXES, Outcome, Request, vector
+from simtrack.envs.arm import ArmKinematics
+from simtrack.envs.front_macros import LIFT, STROKE
+from simtrack.envs.fronts import BEFORE, COMFORT, Front, FrontReach, followed, turned
+from simtrack.envs.observations import OUTCOMES, decode
+from simtrack.envs.planning import believed
+from simtrack.envs.policies import Briefing
+from simtrack.envs.settings import CONTROL_HZ
+from simtrack.errors import InvalidValueError
+from simtrack.geometry.transforms import apply, inverse, transform_planar, yaw_of
+from simtrack.simulation.agents.floor_plan import FloorPlan
+
+Plan: TypeAlias = Generator[Float32, None, None]
+"""Actions; each is answered by the next observation."""
+Tried: TypeAlias = Generator[Float32, None, bool]
+"""The same, and whether it worked."""
+
+FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad(82.0), np.deg2rad(72.0)
+"""Radians: far enough to reach in; a microwave's door is pushed shut again from the front."""
+NEARLY = np.deg2rad(9.0)
+"""Radians off the wanted position that do not matter."""
+SHUT = np.deg2rad(3.0)
+"""Radians up to which a door is believed to be shut."""
+FRESH = 1.0
+"""Seconds since something was seen, up to which it counts as known."""
+VIEW = 1.25
+"""Metres from which something is looked at."""
+TURNS = np.deg2rad([0, 15, -15, 30, -30, 45, -45])
+ASIDE = (0.0, 0.2, -0.2, 0.35, -0.35)
+AHEAD = (0.8, 0.75, 0.85, 0.7, 0.9, 0.65)
+"""Where a thing may be from the base that the arm works on: radians off straight, metres to the left, ahead."""
+ROOM = 0.29
+"""Metres around the middle of the base that must be free where it stands."""
+CAMERA_HEIGHT = 1.12
+"""Metres of the camera above the floor, with the torso down."""
+INTO = 0.075
+"""Metres behind the edge of a board at which the middle of the item is put down."""
+HALF_WIDTH = 0.085
+"""Metres to each side of the item's middle that must be free on its way: hand and item."""
+RUN_UP = 0.4
+"""Metres before the place where something is inserted from which the robot drives straight."""
+TRIES = 3
+
+
+class FetchMealPolicy:
+    """Goes through the stages of the task; what fails is tried again from elsewhere."""
+
+    def __init__(self, briefing: Briefing, mode: str) -> None:
+        self._briefing, self._mode = briefing, mode
+        (self._goal,) = briefing.goals
+        self._reach = FrontReach(ArmKinematics(briefing.robot))
+        self._fridge = Front(_door(briefing, "fridge"))
+        self._microwave = Front(_door(briefing, self._goal.reference))
+        self._board = _board(briefing, self._goal.reference, self._microwave)
+        self.begin(np.random.default_rng(0))
+
+    def begin(self, rng: np.random.Generator) -> None:
+        """See `simtrack.envs.policies.Policy`."""
+        self._floor = FloorPlan(self._briefing.static_map)
+        self._gaze: Float64 | None = None
+        self._lift = 0.3
+        self._plan = self._fetch()
+
+    def act(self, observation: Any) -> Float32:
+        """See `simtrack.envs.policies.Policy`."""
+        arrays = self._briefing.arrays(observation, self._mode)
+        self._belief, _ = decode(arrays, self._briefing.layout, self._briefing.robot)
+        self._outcome = OUTCOMES[int(np.argmax(arrays["macro"]))]
+        self._holds = bool(arrays["holding"].any())
+        self._pan, self._tilt, self._torso = arrays["joints"].tolist()
+        return next(self._plan)
+
+    # ----------------------------------------------------------------------------------------------------------- plans
+
+    def _fetch(self) -> Plan:
+        while True:
+            if not self._holds:
+                yield from self._open(self._microwave, MICROWAVE_OPEN)
+                yield from self._open(self._fridge, FRIDGE_OPEN, more=True)
+                yield from self._take()
+            if self._holds:
+                yield from self._insert()
+            if not self._holds and self._is_in():
+                yield from self._open(self._microwave, 0.0)
+            yield self._move()
+
+    def _open(self, front: Front, angle: float, *, more: bool = False) -> Tried:
+        """Bring a door to an angle off its closed position; `more`: or beyond. Closes it with an angle of 0."""
+        a = front.articulation
+        wanted = min(a.lower + angle, a.upper)
+        for _ in range(TRIES):
+            yield from self._see(front)
+            q = self._joint(a).position
+            near = SHUT if angle == 0.0 else NEARLY
+            if abs(q - wanted) < near or (more and q > wanted):
+                return True
+            yield from self._raise(0.3)
+            spot = front.spot(COMFORT + 0.3)
+            stance = None if spot is None else self._door_stance(front, spot, q, wanted)
+            if spot is None or stance is None:
+                return False
+            yield from self._drive(stance)
+            yield from self._see(front, move=False)
+            q = self._joint(a).position
+            push = wanted if angle > 0.0 else a.lower - 0.03
+            yield from self._ask(Request("articulate", self._in_base(front.at(spot, q)[0]), push))
+            yield from self._straight(-0.1)
+        return False
+
+    def _take(self) -> Tried:
+        item = self._goal.subject
+        middle = self._shelf()
+        for _ in range(TRIES):
+            yield from self._view(middle, self._fridge.outwards_closed)
+            track = yield from self._look_for(item, middle)
+            if track is None:
+                middle = middle + (0.0, 0.0, -0.25) if middle[2] > 0.8 else middle + (0.0, 0.0, 0.3)
+                continue
+            place = track.T_map_object[:3, 3]
+            yield from self._raise(float(np.clip(place[2] - COMFORT, 0.0, 0.35)))
+            stance = self._stance(place, -self._fridge.outwards_closed, BEFORE, 0.0)
+            if stance is None:
+                return False
+            yield from self._drive(stance)
+            yield from self._look_for(item, place)
+            track = believed(self._belief, item)
+            if track is not None:
+                yield from self._ask(Request("take", self._in_base(track.T_map_object[:3, 3])))
+            yield from self._straight(-0.4)
+            if self._holds:
+                return True
+        return False
+
+    def _insert(self) -> Plan:
+        place, inwards, side = self._inside()
+        yield from self._raise(float(np.clip(place[2] + 0.04 - COMFORT, 0.0, 0.35)))
+        stance = self._stance(place - 0.03 * inwards, inwards, STROKE, LIFT, RUN_UP, side)
+        if stance is None:
+            yield self._move()
+            return
+        before = stance.copy()  # with what is held stretched out, the last metre is driven straight
+        before[:2, 3] -= RUN_UP * stance[:2, 0]
+        self._gaze = place
+        yield from self._drive(before)
+        yield from self._straight(RUN_UP)
+        yield from self._wait(8)
+        yield from self._ask(Request("insert", self._in_base(place)))
+        yield from self._straight(-0.3)
+
+    def _is_in(self) -> bool:
+        track = believed(self._belief, self._goal.subject)
+        return self._outcome is Outcome.DONE or track is not None
+
+    # ------------------------------------------------------------------------------------------------- what is believed
+
+    def _joint(self, articulation: Articulation) -> JointEstimate:
+        return next(joint for joint in self._belief.joints if joint.name == articulation.name)
+
+    def _fresh(self, seen: int | None) -> bool:
+        return seen is not None and self._belief.stamp - seen < FRESH * NANOSECONDS
+
+    def _shelf(self) -> Float64:
+        """(3,) where the item is sought first: behind the fridge's door, at the height of the shoulder."""
+        door = self._fridge.articulation.vertices.astype(float)
+        middle = door.mean(axis=0)
+        middle[2] = min(max(0.85, door[:, 2].min()), door[:, 2].max())
+        return middle - 0.1 * self._fridge.outwards_closed
+
+    def _inside(self) -> tuple[Float64, Float64, float]:
+        """(3,) where the item shall be in the microwave, and (3,) the direction in, past the door as it is now.
+
+        Last, 1 if the door's hinge is on the left of who looks in, else -1: there the robot should not stand.
+        """
+        T_map_board, size = self._board
+        a = self._microwave.articulation
+        opened = self._joint(a).position - a.lower
+        hinge = float(apply(inverse(T_map_board), a.anchor[None])[0][1])
+        width = float(np.ptp((a.vertices - a.anchor) @ T_map_board[:3, 1]))
+        side = -float(np.sign(hinge))
+        tip = hinge + side * width * float(np.cos(opened))
+        far = side * (size[1] / 2 - HALF_WIDTH)
+        # From the leaf's tip to the far wall there has to be room for the hand.
+        y = side * min(max(side * tip + HALF_WIDTH + 0.01, 0.0), max(side * far, 0.0))
+        height = float(self._briefing.models[self._goal.subject].extents[2]) / 2
+        local = np.array([size[0] / 2 - INTO, y, height])
+        return apply(T_map_board, local[None])[0], -T_map_board[:3, 0], side
+
+    # --------------------------------------------------------------------------------------------------------- stances
+
+    def _candidates(self, place: Float64, inwards: Float64, side: float = 0.0) -> Iterator[Float64]:
+        """(4, 4) T_map_base from which a place is before the arm, the straightest first, on free floor.
+
+        With a `side` of 1 or -1 the place is rather to the left or right of the robot.
+        """
+        for turn in TURNS.tolist():
+            ahead = turned(inwards, turn)
+            for left in sorted(ASIDE, key=lambda left: -side * left):
+                for forward in AHEAD:
+                    T = transform_planar(0.0, 0.0, float(np.arctan2(ahead[1], ahead[0])))
+                    T[:2, 3] = place[:2] - (T[:3, :3] @ [forward, left, 0.0])[:2]
+                    if self._floor.clearance_at(*T[:2, 3].tolist()) > ROOM:
+                        yield T
+
+    def _door_stance(self, front: Front, spot: Float64, position: float, wanted: float) -> Float64 | None:
+        place, inwards = front.at(spot, position)
+        best: tuple[float, Float64] | None = None
+        for T in self._candidates(place, inwards):
+            end = followed(front, spot, position, wanted, T)
+            if self._floor.clearance_at(*end[:2, 3].tolist()) < ROOM:
+                continue
+            lean = self._reach.follows(front, spot, (position, wanted), T, self._lift)
+            if lean is not None and (best is None or lean < best[0]):
+                best = lean, T
+            if best is not None and best[0] < np.deg2rad(59.0):
+                break
+        return None if best is None else best[1]
+
+    def _stance(
+        self, place: Float64, inwards: Float64, stroke: float, lift: float, run_up: float = 0.0, side: float = 0.0
+    ) -> Float64 | None:
+        """Where to stand so that a level cup goes straight to a place and has come from `stroke` metres before it."""
+        for T in self._candidates(place, inwards, side):
+            behind = T[:2, 3] - run_up * T[:2, 0]
+            if self._floor.clearance_at(*behind.tolist()) < ROOM:
+                continue
+            T_base_map = inverse(T)
+            at, ahead = apply(T_base_map, place[None])[0] + (0.0, 0.0, lift), T_base_map[:3, :3] @ inwards
+            inside = self._reach.joints(at, ahead, self._lift, level=True)
+            if inside is None:
+                continue
+            if self._reach.joints(at - stroke * ahead, ahead, self._lift, level=True) is not None:
+                return T
+        return None
+
+    # ------------------------------------------------------------------------------------------------------- movements
+
+    def _see(self, front: Front, *, move: bool = True) -> Plan:
+        """Look at a door until it is known how far it is open."""
+        a = front.articulation
+        middle = a.vertices.astype(float).mean(axis=0)
+        middle[2] = min(middle[2], 1.2)
+        if move and not self._fresh(self._joint(a).last_seen):
+            yield from self._view(middle, front.outwards_closed)
+        self._gaze = front.at(middle, self._joint(a).position)[0]
+        for _ in range(25):
+            yield self._move()
+            if self._fresh(self._joint(a).last_seen) and self._joint(a).last_seen == self._belief.stamp:
+                break
+        yield from self._wait(3)
+
+    def _view(self, place: Float64, outwards: Float64) -> Plan:
+        """Go to where a place can be looked at from the front, from the nearest free floor there."""
+        self._gaze = place
+        best: tuple[float, Float64] | None = None
+        here = self._belief.localization.T_map_base[:2, 3]
+        for turn in np.deg2rad([0, 20, -20, 40, -40]).tolist():
+            for distance in (VIEW, 1.1, 1.4, 0.95, 1.6):
+                xy = (place + distance * turned(outwards, turn))[:2]
+                if self._floor.clearance_at(*xy.tolist()) < ROOM + 0.03:
+                    continue
+                cost = abs(turn) + abs(distance - VIEW) + 0.1 * float(np.linalg.norm(xy - here))
+                if best is None or cost < best[0]:
+                    best = cost, xy
+        if best is None:
+            return
+        ahead = place[:2] - best[1]
+        T = transform_planar(float(best[1][0]), float(best[1][1]), float(np.arctan2(ahead[1], ahead[0])))
+        yield from self._drive(T, near=0.12)
+
+    def _look_for(self, name: str, place: Float64) -> Generator[Float32, None, Track | None]:
+        """Look at a place until a thing has been seen for a while."""
+        self._gaze, seen = place, 0
+        for _ in range(45):
+            track = believed(self._belief, name)
+            seen = seen + 1 if track is not None and self._fresh(track.last_seen) else 0
+            if seen >= 8:
+                return track
+            yield self._move()
+        return believed(self._belief, name)
+
+    def _drive(self, T_map_goal: Float64, near: float = 0.03) -> Tried:
+        """Drive to a pose: along a planned way, then straight there, then turn."""
+        goal, yaw = T_map_goal[:2, 3], yaw_of(T_map_goal)
+        path = self._floor.plan(self._belief.localization.T_map_base[:2, 3], goal)
+        way = [goal] if path is None else [*path[3:].tolist(), goal]
+        index = 0
+        for _ in range(300):
+            xy = self._belief.localization.T_map_base[:2, 3]
+            while index < len(way) - 1 and float(np.linalg.norm(way[index] - xy)) < 0.25:
+                index += 1
+            offset = np.asarray(way[index]) - xy
+            distance = float(np.linalg.norm(offset))
+            if index == len(way) - 1 and distance < near:
+                break
+            heading = yaw_of(self._belief.localization.T_map_base)
+            bearing = wrapped(float(np.arctan2(offset[1], offset[0])) - heading)
+            if index == len(way) - 1 and distance < 0.3 and abs(bearing) > np.pi / 2:  # it lies behind
+                bearing = wrapped(bearing + np.pi)
+                speed = 0.0 if abs(bearing) > 0.15 else -min(0.2, 0.6 * distance + 0.03)
+                yield self._move(linear=speed, angular=float(np.clip(1.8 * bearing, -0.6, 0.6)))
+                continue
+            left = float(np.linalg.norm(goal - xy))
+            speed = 0.0 if abs(bearing) > 0.35 else min(0.45, 0.8 * left + 0.03)
+            yield self._move(linear=speed, angular=float(np.clip(1.8 * bearing, -0.8, 0.8)))
+        for _ in range(120):
+            gap = wrapped(yaw - yaw_of(self._belief.localization.T_map_base))
+            if abs(gap) < 0.02:
+                break
+            yield self._move(angular=float(np.clip(1.6 * gap, -0.7, 0.7) + 0.02 * np.sign(gap)))
+        yield from self._wait(4)
+        return float(np.linalg.norm(self._belief.localization.T_map_base[:2, 3] - goal)) < 0.1
+
+    def _straight(self, distance: float) -> Plan:
+        """Go straight ahead, or back if negative."""
+        begin = self._belief.localization.T_map_base[:2, 3].copy()
+        for _ in range(60):
+            left = abs(distance) - float(np.linalg.norm(self._belief.localization.T_map_base[:2, 3] - begin))
+            if left < 0.02:
+                break
+            yield self._move(linear=float(np.sign(distance)) * min(0.25, left + 0.05))
+        yield from self._wait(3)
+
+    def _raise(self, lift: float) -> Plan:
+        """Bring the torso to a height."""
+        self._lift = lift
+        for _ in range(60):
+            if abs(self._torso - lift) < 0.003:
+                break
+            yield self._move()
+
+    def _wait(self, steps: int) -> Plan:
+        for _ in range(steps):
+            yield self._move()
+
+    def _ask(self, request: Request) -> Plan:
+        """Until the arm has done it, or has said why not."""
+        yield request.action(self._briefing.layout.macros)
+        while self._outcome is Outcome.BUSY:
+            yield self._move()
+
+    def _move(self, linear: float = 0.0, angular: float = 0.0) -> Float32:
+        """An action that drives, and looks where the policy looks."""
+        pan, tilt = self._towards()
+        speeds = {
+            "linear": linear / AXES["linear"],
+            "angular": angular / AXES["angular"],
+            "pan": (pan - self._pan) * CONTROL_HZ / AXES["pan"] / 2.0,
+            "tilt": (tilt - self._tilt) * CONTROL_HZ / AXES["tilt"] / 2.0,
+            "torso": (self._lift - self._torso) * CONTROL_HZ / AXES["torso"] / 2.0,
+        }
+        return np.clip(vector(speeds, self._briefing.layout.macros), -1.0, 1.0)
+
+    def _towards(self) -> tuple[float, float]:
+        """Angles of the head that look at the place that is gazed at."""
+        if self._gaze is None:
+            return 0.0, -0.4
+        x, y, z = self._in_base(self._gaze)
+        pan = float(np.clip(np.arctan2(y, x), -1.1, 1.1))
+        rise = z - (CAMERA_HEIGHT + self._torso)
+        return pan, float(np.clip(np.arctan2(rise, max(np.hypot(x, y), 0.2)), -0.9, 0.4))
+
+    def _in_base(self, place: Float64) -> Float64:
+        return apply(inverse(self._belief.localization.T_map_base), place[None])[0]
+
+
+def _door(briefing: Briefing, name: str) -> Articulation:
+    """The largest door of a piece of furniture, by its name or class.
+
+    Raises:
+        InvalidValueError: the survey knows none.
+    """
+    doors = [
+        a
+        for a in briefing.static_map.articulations
+        if a.kind == "revolute" and (a.semantic_class == name or a.name.startswith(f"{name}/"))
+    ]
+    if not doors:
+        raise InvalidValueError("static_map", name, "a map with a door of it")
+    return max(doors, key=lambda a: float(np.prod(np.sort(np.ptp(a.vertices, axis=0))[1:])))
+
+
+def _board(briefing: Briefing, name: str, front: Front) -> tuple[Float64, Float64]:
+    """(4, 4) T_map_board with x towards the door, and (2,) size of the lowest board of a piece of furniture."""
+    entity: MapEntity = next(e for e in briefing.static_map.entities if e.name == name)
+    T_map_face, size = min(
+        ((T, size) for T, size in entity.supports if np.prod(size) > 0.03), key=lambda face: float(face[0][2, 3])
+    )
+    out = front.outwards_closed
+    local = T_map_face[:3, :3].T @ out
+    T = np.eye(4)
+    T[:3, :3] = np.stack([out, np.cross([0.0, 0.0, 1.0], out), [0.0, 0.0, 1.0]], axis=1)
+    T[:3, 3] = T_map_face[:3, 3]
+    return T, np.asarray(size)[::-1] if abs(local[1]) > abs(local[0]) else np.asarray(size)
+
+
+def wrapped(angle: float) -> float:
+    """The same angle between -pi and pi, radians."""
+    return float(np.arctan2(np.sin(angle), np.cos(angle)))
