@@ -1,7 +1,8 @@
 """Scores a running closed loop against the simulation's ground truth, stage by stage.
 
 The cheap figures (poses of robot and objects) are taken at every camera stamp, the dear ones (ids of every pixel,
-distances from surfaces, relations, the noise floor) every half second. None of it is fed back to the stack.
+distances from surfaces, relations, the noise floor) every half second, BOP's recall every second. None of it is fed
+back to the stack.
 """
 
 from collections import deque
@@ -100,7 +101,7 @@ class Evaluator:
         self.album = Album(0, duration)
         self._scans: deque[LidarScan] = deque(maxlen=8)
         self._images: deque[RgbdFrame] = deque(maxlen=8)
-        self._next: dict[str, int] = {"camera": 0, "lidar": 0, "objects": 0}
+        self._next: dict[str, int] = {"camera": 0, "lidar": 0, "objects": 0, "bop": 0}
         self._last_scan = self._last_stamp = -1
         self.advanced = False
         """Whether the frame observed last brought a new belief."""
@@ -124,7 +125,9 @@ class Evaluator:
         if self._due("objects", belief.stamp):
             self.relations.observe(belief.relations, objects, truth)
             self.floor.observe(frame, objects)
+        if self._due("bop", belief.stamp):
             self.bop.observe(frame, objects)
+            self._next["bop"] += PERIOD
         self._see_camera(belief)
         self._see_lidar(belief)
         self.album.see(frame, belief, objects)

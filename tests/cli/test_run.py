@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from simtrack.evaluation.metrics import read_metrics
-from tests.cli.commands import Done, simtrack_command, simtrack_process, start
+from tests.cli.commands import Done, refused, simtrack_command, simtrack_process, start
 
 SECONDS = 1.2
 ASKED_FOR = """
@@ -90,6 +90,45 @@ def test_same_seed_gives_the_same_with_one_thread_and_two(folder: Path, tmp_path
     assert {n: m for n, m in ours.items() if theirs[n] != m and not n.startswith("speed.")} == {}
     for name in ("estimates.csv", "tracks.csv", "trajectory.csv", "poses.csv", "simtrack_workbench-test.csv"):
         assert (again / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+FALTERS = """
+from simtrack.contracts import Status, TrackerResult
+
+
+class Falters:
+    calls = 0
+
+    def update(self, frame, T_map_camera, covariance, hypotheses=()):
+        self.calls += 1
+        if self.calls in (3, 4):
+            raise RuntimeError("no memory")
+        return TrackerResult(0 if self.calls == 6 else frame.stamp, (), Status.OK)
+"""
+
+
+def test_a_tracker_of_others_that_falters_misses_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "falters.py").write_text(FALTERS)
+    monkeypatch.syspath_prepend(tmp_path)
+    out = tmp_path / "run"
+    arguments = "run", "--duration", 0.4, "--renderer", "embree", "--tracker", "falters:Falters", "--out", out
+    done = simtrack_command(*arguments)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the tracker missed 3 frames: frames 2-3, 5" in " ".join(done.stderr.split())
+    metrics = read_metrics(out / "metrics.json")
+    assert (metrics["foreign.tracker.frames"].value, metrics["run.images"].value) == (12, 12)
+    assert (metrics["foreign.tracker.raised"].value, metrics["foreign.tracker.invalid"].value) == (2, 1)
+    with (out / "faults.csv").open() as file:
+        rows = [(row["frame"], row["kind"], row["message"]) for row in csv.DictReader(file)]
+    assert rows[:2] == [("2", "raised", "RuntimeError: no memory"), ("3", "raised", "RuntimeError: no memory")]
+    assert "falters:Falters" in (out / "config.yaml").read_text()
+
+
+def test_a_tracker_that_cannot_be_loaded_is_refused(tmp_path: Path) -> None:
+    told = refused("run", "--tracker", "no_such_module_at_all:Tracker", "--out", tmp_path / "run")
+    assert "tracker 'no_such_module_at_all:Tracker': no module 'no_such_module_at_all'" in told
+    assert not (tmp_path / "run").exists()
+    assert "allowed" in refused("run", "--stage-limit", 0, "--out", tmp_path / "run")
 
 
 def test_a_stop_keeps_what_was_measured(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from simtrack.contracts import Localization, Status
 from simtrack.errors import FileFormatError
 from simtrack.evaluation.metrics import Metric, measured, quantile, read_metrics, write_metrics
 from simtrack.evaluation.trajectory import TrajectoryEvaluator
-from simtrack.geometry.transforms import transform_planar
+from simtrack.geometry.transforms import perturb, transform_planar
 
 TENTH = 100_000_000
 
@@ -60,3 +60,24 @@ def test_broken_metrics_name_the_file(tmp_path, text: str) -> None:
     path.write_text(text)
     with pytest.raises(FileFormatError, match=r"metrics\.json"):
         read_metrics(path)
+
+
+def test_errors_are_those_of_evo() -> None:
+    """Values of evo 1.38.1: APE without alignment; RPE over 10 frames, all pairs (`evo_rpe -d 10 -u f --all_pairs`)."""
+    rng = np.random.default_rng(7)
+    true = [np.eye(4)]
+    for _ in range(39):
+        true.append(true[-1] @ perturb(np.eye(4), rng.normal(0, [0.05, 0.02, 0.01, 0.02, 0.02, 0.1])))
+    evaluator = TrajectoryEvaluator()
+    for k, T in enumerate(true):
+        estimated = perturb(T, rng.normal(0, [0.004, 0.004, 0.002, 0.003, 0.003, 0.01]))
+        evaluator.observe(k * TENTH, Localization(k * TENTH, estimated, np.eye(6), Status.OK), T)
+    metrics = evaluator.metrics()
+    evo = {
+        "ate_rmse": 0.0058277654602230415, "ate_max": 0.010575264290463, "rotation_rmse": 0.009822227519871777,
+        "rotation_max": 0.020421262878750887, "rpe.translation.rmse": 0.00813936843809109,
+        "rpe.translation.median": 0.00734686874279447, "rpe.rotation.rmse": 0.013106419396914818,
+        "rpe.rotation.median": 0.01037320729759826,
+    }  # fmt: skip
+    for name, value in evo.items():
+        assert metrics[f"localization.{name}"].value == pytest.approx(value, rel=1e-9), name
