@@ -62,11 +62,11 @@ def at(env: SimtrackEnv, name: str) -> np.ndarray:
 
 
 def outcome(env: SimtrackEnv, request: Request | None, steps: int = 1) -> Outcome:
-    action = vector({}, MACROS) if request is None else request.action(MACROS)
+    action = vector({}, Tidy.macros) if request is None else request.action(Tidy.macros)
     observation: Any = {}
     for _ in range(steps):
         observation = env.step(action)[0]
-        action = vector({}, MACROS)
+        action = vector({}, Tidy.macros)
     return OUTCOMES[int(np.argmax(observation["macro"]))]
 
 
@@ -79,7 +79,7 @@ def test_what_cannot_be_done_is_told_at_once(tidy: SimtrackEnv) -> None:
     assert outcome(tidy, Request("grasp", at(tidy, "screwdriver"))) is Outcome.OUT_OF_REACH
     before = tidy.steering.command
     assert outcome(tidy, Request("grasp", relay)) is Outcome.BUSY
-    drive = vector({"linear": 1.0, "torso": -1.0, "pan": 0.5}, MACROS)
+    drive = vector({"linear": 1.0, "torso": -1.0, "pan": 0.5}, Tidy.macros)
     tidy.step(drive)
     after = tidy.steering.command
     assert (after.linear, after.torso) == (0.0, before.torso) and after.head_pan > before.head_pan
@@ -140,7 +140,7 @@ def test_goals_are_rewarded_by_how_near_they_are(tidy: SimtrackEnv) -> None:
         ({"task": Tidy(("relay in shelf",))}, "materialbox"),
         ({"objects": ["relay"]}, "object of the scene"),
     ],
-    ids=str,
+    ids=["no cup", "unknown subject", "unknown reference", "missing object"],
 )
 def test_tasks_that_a_scene_does_not_allow_raise_when_made(make: Make, arguments: dict[str, Any], told: str) -> None:
     with pytest.raises(SimtrackError, match=told):
