@@ -10,7 +10,8 @@ from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, Int32, 
 from simtrack.errors import InvalidValueError, RenderingError
 from simtrack.geometry.transforms import transform
 from simtrack.raycast import RayBundle, RayHits
-from simtrack.simulation.world import COLLISION, COLOR_ONLY, DEPTH_ONLY, SENSOR_BODIES, SHOWN, World
+from simtrack.simulation.composer import COLLISION, COLOR_ONLY, DEPTH_ONLY, SHOWN
+from simtrack.simulation.world import SENSOR_BODIES, World
 from simtrack.simulation.world_rays import WorldRays
 
 if TYPE_CHECKING:

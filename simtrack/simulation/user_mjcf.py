@@ -11,8 +11,8 @@ from simtrack.contracts import Float64
 from simtrack.errors import FileFormatError
 from simtrack.geometry.meshes import Mesh, box_mesh, cylinder_mesh, painted, transformed
 from simtrack.geometry.transforms import rotation_from_quaternion, transform
+from simtrack.simulation.composer import COLLISION
 from simtrack.simulation.scene_file import SceneFile
-from simtrack.simulation.world import COLLISION
 
 if TYPE_CHECKING:
     import mujoco

@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from simtrack.contracts import Float64, Int32, Uint8
+from simtrack.contracts import Float64, Int32
 from simtrack.errors import FileFormatError, InvalidValueError, UnknownNameError
 from simtrack.geometry.kinematics import KinematicTree, Link
 from simtrack.geometry.meshes import Mesh, area, painted
@@ -16,6 +16,7 @@ from simtrack.objects import ObjectModel, load_object
 from simtrack.objects.tiago import CAMERA, GRIPPER, LIDAR, tiago
 from simtrack.simulation import hand
 from simtrack.simulation.building.parts import StaticWorld
+from simtrack.simulation.composer import COLLISION, COLOR_ONLY, DEPTH_ONLY, Composer, Kind
 from simtrack.simulation.placement import place_objects, start_pose
 from simtrack.simulation.randomness import stream
 from simtrack.simulation.robot import PREFIX as ROBOT
@@ -28,12 +29,8 @@ if TYPE_CHECKING:
 TIMESTEP_NS = 2_000_000
 """Physics step, nanoseconds."""
 
-SHOWN, COLOR_ONLY, DEPTH_ONLY, COLLISION = 0, 1, 2, 3
-"""Geom groups: seen always, in RGB images only, in depth and id images only, never."""
 STATIC_BITS, OBJECT_BITS, ROBOT_BITS, HAND_BITS = (1, 0), (2, 15), (4, 1), (8, 0)
 """contype and conaffinity: objects touch everything, the robot touches furniture and objects but not itself."""
-
-Kind: TypeAlias = Literal["static", "catalogue", "clutter", "actor", "robot"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,75 +74,6 @@ class World:
         return any(thing.id == name for thing in self.scene.objects)
 
 
-class _Composer:
-    """Collects meshes, colours and instances while a spec is being composed."""
-
-    def __init__(self) -> None:
-        import mujoco
-
-        self.spec = mujoco.MjSpec()
-        self.instances: list[tuple[str, Kind, str, Mesh, Float64]] = []
-        self._palette: dict[tuple[int, int, int], int] = {}
-        self._meshes: dict[int, tuple[str, Mesh]] = {}
-        self._colored: list[tuple[object, Mesh]] = []
-
-    def mesh(self, name: str, mesh: Mesh, colored: bool = True) -> str:
-        """Name of the asset that holds a mesh; the same mesh is stored once."""
-        import mujoco
-
-        if id(mesh) in self._meshes:
-            return self._meshes[id(mesh)][0]
-        asset = self.spec.add_mesh(name=name)
-        asset.uservert = mesh.vertices.ravel()
-        asset.userface = mesh.faces.ravel()
-        # Open sheets have no volume; no inertia is taken from meshes anyway.
-        asset.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        self._meshes[id(mesh)] = (name, mesh)
-        if colored and mesh.face_colors is not None:
-            self._colored.append((asset, mesh))
-        return name
-
-    def show(self, body: "mujoco.MjsBody", asset: str, name: str, T: Float64, group: int = SHOWN) -> None:
-        """Give a body a visible mesh that touches nothing."""
-        import mujoco
-
-        body.add_geom(
-            name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=asset, material="palette", group=group, mass=0.0,
-            contype=0, conaffinity=0, pos=T[:3, 3], quat=quaternion_from_rotation(T[:3, :3]),
-        )  # fmt: skip
-
-    def show_user_shape(self, body: "mujoco.MjsBody", name: str, mesh: Mesh, T: Float64) -> None:
-        """Show a shape of the user's MJCF; it counts as furniture named after its body."""
-        self.show(body, self.mesh(name, mesh), f"static/{name}", T)
-        self.instances.append((name.rpartition("#")[0], "static", body.name, mesh, T))
-
-    def show_own_shape(self, body: "mujoco.MjsBody", name: str, mesh: Mesh, T: Float64) -> None:
-        """The same where the MJCF is the whole world: things have the names that they have there."""
-        from simtrack.simulation.user_mjcf import PREFIX
-
-        self.show(body, self.mesh(name, mesh), f"static/{name.removeprefix(PREFIX)}", T)
-        self.instances.append((name.removeprefix(PREFIX).rpartition("#")[0], "static", body.name, mesh, T))
-
-    def finish(self) -> "mujoco.MjModel":
-        """Compile; every face samples one texel, so that colours are exact and no texture is ever filtered."""
-        import mujoco
-
-        used = [np.unique(_color_keys(mesh.face_colors), return_inverse=True) for _, mesh in self._colored]
-        keys = np.unique(np.concatenate([*(own for own, _ in used), _color_keys(np.full((1, 3), 200, np.uint8))]))
-        palette = np.stack([keys >> 16, keys >> 8 & 255, keys & 255], axis=1).astype(np.uint8)
-        texture = self.spec.add_texture(
-            name="palette", type=mujoco.mjtTexture.mjTEXTURE_2D, width=len(palette), height=1, nchannel=3
-        )
-        texture.data = palette.tobytes()
-        material = self.spec.add_material(name="palette", specular=0.1, shininess=0.2)
-        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "palette"
-        texcoords = np.stack([(np.arange(len(palette)) + 0.5) / len(palette), np.full(len(palette), 0.5)], axis=1)
-        for (asset, _), (own, local) in zip(self._colored, used, strict=True):
-            asset.usertexcoord = texcoords[np.searchsorted(keys, own)].ravel()  # type: ignore[attr-defined]
-            asset.userfacetexcoord = np.repeat(local, 3).astype(np.int32)  # type: ignore[attr-defined]
-        return self.spec.compile()
-
-
 def build_world(
     scene: SceneFile,
     seed: int,
@@ -174,7 +102,7 @@ def build_world(
     poses = place_objects(scene, static, models, stream(seed, "placement"))
     robot = tiago()
 
-    composer = _Composer()
+    composer = Composer()
     _set_options(composer.spec, image_size, sleep)
     if scene.static.builder == "mjcf":
         from simtrack.simulation.mjcf_world import floor_height
@@ -292,7 +220,7 @@ def _set_options(spec: "mujoco.MjSpec", image_size: tuple[int, int], sleep: bool
         light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
 
 
-def _add_static(composer: _Composer, static: StaticWorld) -> None:
+def _add_static(composer: Composer, static: StaticWorld) -> None:
     import mujoco
 
     ground = composer.spec.worldbody
@@ -310,7 +238,7 @@ def _add_static(composer: _Composer, static: StaticWorld) -> None:
             )  # fmt: skip
 
 
-def _add_object(composer: _Composer, name: str, model: ObjectModel, T_map_object: Float64, kind: Kind) -> None:
+def _add_object(composer: Composer, name: str, model: ObjectModel, T_map_object: Float64, kind: Kind) -> None:
     import mujoco
 
     body = composer.spec.worldbody.add_body(
@@ -337,12 +265,6 @@ def _add_object(composer: _Composer, name: str, model: ObjectModel, T_map_object
     composer.instances.append((name, kind, f"object/{name}", model.mesh, identity))
 
 
-def _color_keys(colors: Uint8 | None) -> np.ndarray:
-    """(F,) numbers that order colours (F, 3) as their channels do; single numbers are found faster than rows."""
-    assert colors is not None
-    return colors.astype(np.int32) @ np.array([65536, 256, 1], np.int32)
-
-
 def _same_surface(a: Mesh, b: Mesh) -> bool:
     """Whether one mesh is a mere retessellation of the other (then the lighter one can stand for both)."""
     if not np.allclose(a.bounds, b.bounds, rtol=0.0, atol=1e-6):
@@ -351,7 +273,7 @@ def _same_surface(a: Mesh, b: Mesh) -> bool:
     return abs(area(a) - whole) <= 1e-5 * whole
 
 
-def _add_robot(composer: _Composer, robot: KinematicTree, fovy: float) -> None:
+def _add_robot(composer: Composer, robot: KinematicTree, fovy: float) -> None:
     def add_visual(body: "mujoco.MjsBody", link: Link) -> str:
         color = tuple(round(255 * channel) for channel in link.color)
         mesh = painted(Mesh(link.vertices.astype(np.float64), link.faces), color)
@@ -366,7 +288,7 @@ def _add_robot(composer: _Composer, robot: KinematicTree, fovy: float) -> None:
     camera.fovy = float(np.degrees(fovy))
 
 
-def _add_suction(composer: _Composer, models: Mapping[str, ObjectModel], static: StaticWorld) -> None:
+def _add_suction(composer: Composer, models: Mapping[str, ObjectModel], static: StaticWorld) -> None:
     """A constraint for each object, door and drawer that ties it to the gripper while the cup holds it."""
     import mujoco
 
@@ -382,7 +304,7 @@ def _add_suction(composer: _Composer, models: Mapping[str, ObjectModel], static:
         )  # fmt: skip
 
 
-def _add_hand(composer: _Composer, scene: SceneFile) -> None:
+def _add_hand(composer: Composer, scene: SceneFile) -> None:
     import mujoco
 
     from simtrack.simulation.scene_file import Carry
@@ -411,7 +333,7 @@ def _add_hand(composer: _Composer, scene: SceneFile) -> None:
 def _assembled(
     scene: SceneFile,
     seed: int,
-    composer: _Composer,
+    composer: Composer,
     static: StaticWorld,
     robot: KinematicTree,
     models: dict[str, ObjectModel],
