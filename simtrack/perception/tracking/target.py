@@ -23,7 +23,7 @@ class TrackerConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     buffer: float = 0.8
     """Depth images are kept this long for late detections, seconds."""
-    cast_time: float = 0.00075
+    cast_time: float = 0.0005
     """A detection of something new, or that contradicts a track, is registered beside the frames; each of the casts
     that this needs is taken to last so long, seconds of the sensor's clock."""
     confirm_detections: int = 2
