@@ -104,6 +104,10 @@ class RegistrationConfig:
     def __post_init__(self) -> None:
         if self.solver not in ("gauss-newton", "umeyama"):
             raise InvalidValueError("RegistrationConfig.solver", self.solver, "gauss-newton, umeyama")
+        if any(step.fine for step in (*self.schedule, *self.track_schedule, self.near)):
+            raise InvalidValueError("RegistrationConfig.schedule", "a fine step", "fine steps only as `finish`")
+        if self.finish is not None and self.finish.repeats != 1:  # a fine cast takes the rays that coarse ones marked
+            raise InvalidValueError("RegistrationConfig.finish", self.finish.repeats, "a single cast: repeats=1")
         if not self.schedule or any(step.gate <= 0.0 or step.kernel <= 0.0 for step in self.schedule):
             raise InvalidValueError(
                 "RegistrationConfig.schedule", self.schedule, "steps with positive gates and kernels"

@@ -159,18 +159,18 @@ def gauss_newton(
     g, g_edge = np.empty((K, 6)), np.empty((K, 6))
     sums = np.empty((K, 4))
     scale = np.ones(6)
-    open_ = active.copy()
+    unsettled = active.copy()
     for step in range(iterations + 1):
-        if not open_.any():
+        if not unsettled.any():
             break
         H[:], H_edge[:], g[:], g_edge[:], sums[:] = 0.0, 0.0, 0.0, 0.0, 0.0
-        point_normal_equations(points, pairs, open_, centres, rotations, shifts, settings.kernel, H, g, sums)
+        point_normal_equations(points, pairs, unsettled, centres, rotations, shifts, settings.kernel, H, g, sums)
         if settings.edges != EDGES_NEVER:
             edge_normal_equations(
                 edges, edge_pairs, camera, centres, rotations, shifts, settings.edge_kernel, H_edge, g_edge
             )
         for k in range(K):
-            if not open_[k]:
+            if not unsettled[k]:
                 continue
             scale[3:] = 1.0 / radii[k]
             outer = scale.reshape(6, 1) * scale
@@ -187,7 +187,7 @@ def gauss_newton(
             surface = np.sqrt((xi[:3] ** 2).sum()) + np.sqrt((xi[3:] ** 2).sum())
             if step == iterations or surface < settings.last_step:
                 covariance[k], constrained[k], stats[k] = P * outer, known, sums[k, :3]
-                open_[k] = False
+                unsettled[k] = False
             if step == iterations:
                 continue
             xi *= scale

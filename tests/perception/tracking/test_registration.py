@@ -118,3 +118,11 @@ def test_nothing_in_view_gives_no_result_and_bad_settings_are_refused() -> None:
         RegistrationConfig(solver="magic")  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match="schedule"):
         RegistrationConfig(schedule=())
+
+
+def test_fine_casts_that_would_have_no_rays_are_refused() -> None:
+    fine = Step(gate=0.006, kernel=3.0, edge_reach=5, fine=True)
+    with pytest.raises(InvalidValueError, match="only as `finish`"):
+        RegistrationConfig(near=fine)
+    with pytest.raises(InvalidValueError, match="repeats=1"):
+        RegistrationConfig(finish=Step(gate=0.006, kernel=3.0, edge_reach=5, fine=True, repeats=2))
