@@ -26,6 +26,7 @@ ROOMS = (
     "simulation",
     "recordings",
     "datasets",
+    "training",
     "evaluation",
     "envs",
     "report",
@@ -34,7 +35,7 @@ ROOMS = (
 )
 """From top to bottom: a room imports only from itself and from rooms above it."""
 
-HIDDEN_FROM_PERCEPTION = {"simulation", "recordings", "datasets", "evaluation", "envs", "report", "benchmarks", "cli"}
+HIDDEN_FROM_PERCEPTION = {"simulation", "recordings", "datasets", "training", "evaluation", "envs", "report", "benchmarks", "cli"}
 HEAVY = {"numba", "scipy", "trimesh", "cv2", "mujoco", "skimage", "shapely", "pyoxigraph", "matplotlib", "embreex"}
 HEAVY |= {"pydantic", "manifold3d", "mcap", "rerun", "tyro", "rich", "ray"}
 IMPORT_NAMES = {

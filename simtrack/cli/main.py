@@ -20,6 +20,7 @@ from simtrack.cli.run import run
 from simtrack.cli.scenes import scenes
 from simtrack.cli.score import score
 from simtrack.cli.trials import trials
+from simtrack.cli.train import train
 from simtrack.cli.validate import validate
 
 VERBS = {
@@ -30,6 +31,7 @@ VERBS = {
     "generate": generate,
     "inspect": inspect,
     "validate": validate,
+    "train": train,
     "reconstruct": reconstruct,
     "check": check,
     "scenes": scenes,

@@ -1,0 +1,58 @@
+"""Boxes from the box network's answer."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from simtrack.contracts import Float64
+
+STRIDE = 8
+"""Pixels of the network's input in a cell of its answer."""
+SAME = 0.5
+"""Boxes of one class that overlap by more than this are one object's."""
+MAX_BOXES = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """One answer."""
+
+    class_index: int
+    corners: Float64
+    """(4,), pixels of the network's input: x min, y min, x max, y max."""
+    score: float
+    """0 to 1."""
+
+
+def decoded_boxes(logits: np.ndarray, distances: np.ndarray, threshold: float) -> list[Box]:
+    """Boxes with a score above `threshold`, best first.
+
+    Args:
+        logits: (classes, h, w), of objects' centres.
+        distances: (4, h, w), logarithms of the distances to the left, upper, right and lower side, in cells.
+        threshold: 0 to 1.
+    """
+    scores = 1.0 / (1.0 + np.exp(-logits.astype(float)))
+    padded = np.pad(scores, ((0, 0), (1, 1), (1, 1)))
+    h, w = scores.shape[1:]
+    around = np.max([padded[:, dv : dv + h, du : du + w] for dv in range(3) for du in range(3)], axis=0)
+    peaks = np.argwhere((scores >= around) & (scores > threshold))
+    order = np.argsort([-scores[tuple(peak)] for peak in peaks], kind="stable") if len(peaks) else []
+    found: list[Box] = []
+    for k in order:
+        c, v, u = (int(value) for value in peaks[k])
+        left, up, right, down = np.exp(distances[:, v, u].astype(float))
+        corners = (np.array([u - left, v - up, u + right, v + down]) + 0.5) * STRIDE - 0.5
+        if all(box.class_index != c or overlap(box.corners, corners) < SAME for box in found):
+            found.append(Box(c, corners, float(scores[c, v, u])))
+        if len(found) == MAX_BOXES:
+            break
+    return found
+
+
+def overlap(a: Float64, b: Float64) -> float:
+    """Intersection over union of two boxes (x min, y min, x max, y max)."""
+    size = np.clip(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0.0, None)
+    common = float(size[0] * size[1])
+    both = float(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2])) - common
+    return common / both if both > 0.0 else 0.0

@@ -1,0 +1,85 @@
+"""Training of the keypoint detector: a data set goes in, two ONNX files come out."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from simtrack.errors import DatasetError, InvalidValueError
+from simtrack.training.shards import CROPS, IMAGES, Shards, Source, open_source, prepare
+
+Part: TypeAlias = Literal["keypoints", "boxes"]
+PARTS: tuple[Part, ...] = ("keypoints", "boxes")
+SAMPLES: dict[Part, int] = {"keypoints": 1_800_000, "boxes": 200_000}
+"""Windows and images that the networks see by default."""
+SHARDS, CLASSES = "shards", "classes.json"
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingConfig:
+    """What `train_part` is to do."""
+
+    data: Path
+    """A data set with a BOP part."""
+    out: Path
+    """Checkpoints, logs and networks."""
+    minutes: float | None = None
+    """Of computing time for each network, over all calls; None: until the default number of samples."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise InvalidValueError("seed", self.seed, "0 or more")
+        if self.minutes is not None and not self.minutes > 0.0:
+            raise InvalidValueError("minutes", self.minutes, "> 0")
+
+
+def prepared(config: TrainingConfig, told: Callable[[int, int], None] | None = None) -> Source:
+    """Make the data set ready for both networks.
+
+    Raises:
+        DatasetError, FileFormatError: it is none that can be learned from, or `out` is another detector's.
+    """
+    source = open_source(config.data)
+    config.out.mkdir(parents=True, exist_ok=True)
+    path = config.out / CLASSES
+    names = list(source.class_names)
+    if path.is_file() and (before := json.loads(path.read_text(encoding="utf-8"))) != names:
+        raise DatasetError(config.data, f"its classes are {names}, but {path} says {before}; choose another --out")
+    path.write_text(json.dumps(names) + "\n", encoding="utf-8")
+    prepare(source, config.out / SHARDS, told)
+    return source
+
+
+def train_part(part: Part, config: TrainingConfig, told: "Callable[[object], None] | None" = None) -> Path:
+    """Train one network on one thread, or carry on, and write it as ONNX; the data set is `prepared` before.
+
+    Raises:
+        DatasetError: a class has no sample.
+    """
+    import torch
+
+    from simtrack.training.export import export_boxes, export_keypoints
+    from simtrack.training.loop import Budget, train
+
+    torch.set_num_threads(1)
+    task = make_task(part, open_source(config.data), config.out / SHARDS)
+    network = train(task, config.out / part, Budget(SAMPLES[part], config.minutes, config.seed), told)
+    path = config.out / f"{part}.onnx"
+    (export_keypoints if part == "keypoints" else export_boxes)(network, task.models, path)
+    return path
+
+
+def make_task(part: Part, source: Source, shards: Path):  # noqa: ANN201
+    """The task of one network."""
+    from simtrack.training.box_task import BoxTask
+    from simtrack.training.keypoint_task import KeypointTask
+
+    kind, dtype = ("crops", CROPS) if part == "keypoints" else ("images", IMAGES)
+    samples, held_out = (Shards(shards, kind, dtype, held_out=share) for share in (False, True))
+    task = (KeypointTask if part == "keypoints" else BoxTask)(source.models, samples, held_out)
+    if task.missing:
+        reason = f"no image shows {', '.join(task.missing)} well enough to be learned; generate more, or leave them out"
+        raise DatasetError(source.root, reason)
+    return task

@@ -1,0 +1,114 @@
+"""The two networks: boxes and classes in an image, keypoints in a window about one box.
+
+Plain convolutions with residual connections: on a CPU they train faster than separable ones of equal accuracy.
+"""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from simtrack.perception.detection.views import CHANNELS
+
+KEYPOINTS = 9
+
+
+def convolved(channels_in: int, channels_out: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    """Convolution, batch normalisation, ReLU."""
+    return nn.Sequential(
+        nn.Conv2d(channels_in, channels_out, kernel, stride, kernel // 2, bias=False),
+        nn.BatchNorm2d(channels_out),
+        nn.ReLU(inplace=True),
+    )
+
+
+class Residual(nn.Module):
+    """Two convolutions beside the identity."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = convolved(channels, channels)
+        self.second = nn.Conv2d(channels, channels, 3, 1, 1, bias=False)
+        self.norm = nn.BatchNorm2d(channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, H, W) to the same shape."""
+        return functional.relu(x + self.norm(self.second(self.first(x))))
+
+
+def _stage(channels_in: int, channels_out: int, blocks: int) -> nn.Sequential:
+    """Half the resolution, then residual blocks."""
+    return nn.Sequential(convolved(channels_in, channels_out, stride=2), *(Residual(channels_out) for _ in range(blocks)))
+
+
+class BoxNetwork(nn.Module):
+    """Heat maps of objects' centres and distances to the sides of their boxes, in cells of 8 pixels.
+
+    CenterNet's heat maps (Zhou, Wang, Kraehenbuehl: Objects as Points, 2019) over one level of a feature pyramid.
+    """
+
+    stride = 8
+
+    def __init__(self, classes: int) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(convolved(CHANNELS, 16, stride=2), _stage(16, 32, 1))
+        self.fine, self.middle, self.coarse = _stage(32, 64, 2), _stage(64, 128, 2), _stage(128, 192, 1)
+        self.from_coarse, self.from_middle = nn.Conv2d(192, 64, 1), nn.Conv2d(128, 64, 1)
+        self.joined = nn.Sequential(convolved(64, 64), Residual(64))
+        self.heat, self.sides = nn.Conv2d(64, classes, 1), nn.Conv2d(64, 4, 1)
+        nn.init.constant_(self.heat.bias, -4.0)  # type: ignore[arg-type]
+        nn.init.constant_(self.sides.bias, 1.0)  # type: ignore[arg-type]
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 5, H, W) to logits (N, classes, H / 8, W / 8) and log distances (N, 4, H / 8, W / 8), in cells."""
+        fine = self.fine(self.stem(image))
+        middle = self.middle(fine)
+        coarse = self.from_coarse(self.coarse(middle))
+        middle = self.from_middle(middle) + functional.interpolate(coarse, size=middle.shape[2:], mode="nearest")
+        joined = self.joined(fine + functional.interpolate(middle, size=fine.shape[2:], mode="nearest"))
+        return self.heat(joined), self.sides(joined).clamp(-4.0, 5.0)
+
+
+class KeypointNetwork(nn.Module):
+    """Where the nine keypoints of an object of a given class lie in a window, and whether there is such an object.
+
+    Each coordinate is a distribution over bins (Li et al.: SimCC, ECCV 2022). In training only, the network also tells
+    which point of the object each cell of 4 pixels shows, which teaches it shapes.
+    """
+
+    size = 64
+
+    def __init__(self, classes: int, bins: int) -> None:
+        super().__init__()
+        self.bins = bins
+        self.stem = nn.Sequential(convolved(CHANNELS, 24, stride=2), Residual(24))
+        self.fine, self.middle, self.coarse = _stage(24, 48, 2), _stage(48, 96, 2), _stage(96, 160, 2)
+        self.told_middle, self.told_coarse = nn.Linear(classes + 2, 96), nn.Linear(classes + 2, 160)
+        cells = (self.size // 16) ** 2
+        self.hidden = nn.Sequential(nn.Linear(160 * cells + classes + 2, 320), nn.ReLU(inplace=True))
+        self.coordinates, self.present = nn.Linear(320, KEYPOINTS * 2 * bins), nn.Linear(320, 1)
+        self.from_coarse, self.from_middle = nn.Conv2d(160, 48, 1), nn.Conv2d(96, 48, 1)
+        self.points = nn.Sequential(convolved(48, 48), nn.Conv2d(48, 4, 1))
+
+    def features(self, window: Tensor, told: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Feature maps at 4, 8 and 16 pixels a cell."""
+        fine = self.fine(self.stem(window))
+        middle = self.middle(fine)
+        middle = functional.relu(middle + self.told_middle(told)[:, :, None, None])
+        coarse = self.coarse(middle)
+        return fine, middle, functional.relu(coarse + self.told_coarse(told)[:, :, None, None])
+
+    def answers(self, coarse: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits (N, 9, 2, bins) of the coordinates, and (N,) of there being an object."""
+        hidden = self.hidden(torch.cat([coarse.flatten(1), told], 1))
+        return self.coordinates(hidden).view(-1, KEYPOINTS, 2, self.bins), self.present(hidden)[:, 0]
+
+    def forward(self, window: Tensor, told: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 5, 64, 64) and (N, classes + 2) to `answers`."""
+        return self.answers(self.features(window, told)[2], told)
+
+    def taught(self, window: Tensor, told: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`answers`, and (N, 4, 16, 16): object points in shares of its half extents, and logits of its mask."""
+        fine, middle, coarse = self.features(window, told)
+        up = self.from_middle(middle) + functional.interpolate(self.from_coarse(coarse), scale_factor=2.0)
+        points = self.points(fine + functional.interpolate(up, scale_factor=2.0))
+        return (*self.answers(coarse, told), points)
