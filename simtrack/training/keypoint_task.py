@@ -215,7 +215,10 @@ def _recoloured(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         small = int(size * rng.uniform(0.35, 0.9))
         rgb = np.asarray(cv2.resize(cv2.resize(rgb, (small, small), interpolation=cv2.INTER_AREA), (size, size)))
     gains = np.exp(rng.normal(0.0, 0.22)) * np.exp(rng.normal(0.0, 0.06, 3))
-    values = 255.0 * (rgb * (gains / 255.0)).clip(0.0, 1.0) ** np.exp(rng.normal(0.0, 0.15))
+    levels = (np.arange(256.0)[:, None] * (gains / 255.0)).clip(0.0, 1.0) ** np.exp(rng.normal(0.0, 0.15))
+    table = (255.0 * levels).astype(np.uint8)
+    rgb = np.asarray(cv2.LUT(rgb, np.ascontiguousarray(table[None])))
     if rng.random() < 0.4:
-        values = values + rng.normal(0.0, rng.uniform(1.0, 8.0), rgb.shape)
-    return values.clip(0.0, 255.0).astype(np.uint8)
+        noise = rng.standard_normal(rgb.shape, np.float32) * np.float32(rng.uniform(1.0, 8.0))
+        rgb = (rgb + noise).clip(0.0, 255.0).astype(np.uint8)
+    return rgb

@@ -7,7 +7,6 @@ keypoint, inside the image or not.
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,14 +126,13 @@ def _model(root: Path, name: str) -> ObjectModel:
 def prepare(source: Source, folder: Path, told: Callable[[int, int], None] | None = None) -> None:
     """Write the shards of all scenes that have none yet; `told` gets how many of how many are done."""
     folder.mkdir(parents=True, exist_ok=True)
-    with ThreadPoolExecutor(1) as pool:
-        for number, scene in enumerate(source.scenes):
-            if not shard(folder, scene.name, "crops").is_file():
-                images, crops = pool.submit(_read_scene, source, scene).result()
-                _save(shard(folder, scene.name, "images"), images)
-                _save(shard(folder, scene.name, "crops"), crops)
-            if told is not None:
-                told(number + 1, len(source.scenes))
+    for number, scene in enumerate(source.scenes):
+        if not shard(folder, scene.name, "crops").is_file():
+            images, crops = _read_scene(source, scene)
+            _save(shard(folder, scene.name, "images"), images)
+            _save(shard(folder, scene.name, "crops"), crops)
+        if told is not None:
+            told(number + 1, len(source.scenes))
 
 
 def shard(folder: Path, scene: str, kind: str) -> Path:
@@ -178,7 +176,7 @@ class Shards:
 
 
 def _save(path: Path, records: np.ndarray) -> None:
-    part = path.with_suffix(".part")
+    part = path.with_suffix(f".{os.getpid()}.part")  # both networks' processes may be making it
     with part.open("wb") as stream:
         np.save(stream, records, allow_pickle=False)
     os.replace(part, path)

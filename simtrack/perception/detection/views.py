@@ -96,7 +96,7 @@ def shown_window(rgb: Uint8, depth: Float32, width: float) -> tuple[Float32, flo
     readings = middle[middle > 0.0]
     if len(readings) < MIN_READINGS:
         return shown, 0.0
-    reference = float(np.median(readings))
+    reference = float(np.partition(readings, len(readings) // 2)[len(readings) // 2])
     valid = depth > 0.0
     shown[3] = np.where(valid, np.clip((depth - reference) / (reference * width), -1.0, 1.0), 0.0)
     shown[4] = valid
