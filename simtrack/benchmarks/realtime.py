@@ -22,12 +22,16 @@ from simtrack.benchmarks.feed import Feed
 from simtrack.benchmarks.harness import Benchmark, Options
 from simtrack.contracts import NANOSECONDS, LidarScan, RgbdFrame, SensorFrame
 from simtrack.perception.localization.measurement import scan_end
-from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.pipeline import PerceptionStack, StackConfig
+from simtrack.perception.tracking.target import TrackerConfig
 from simtrack.recordings import Recording
 
 SWITCH_INTERVAL = 2e-4
 """Seconds after which a thread gives the interpreter to another one that waits for it: what is done beside the frames
 shall not keep the frames waiting (Python's own 5 ms are a sixth of a frame's time)."""
+CAST_TIME = 0.001
+"""Seconds that a cast for a new object is taken to last: what it does last beside the frames on two cores. The
+tracker's default, half of that, is what it lasts on a core of its own; here frames would wait for it."""
 WARM_UP = 2.0
 """Seconds of the feed that do not count: kernels are loaded, objects are born."""
 
@@ -93,9 +97,10 @@ def play(recording: Recording) -> Play:
     from simtrack.recordings import RecordedDetector
 
     assert recording.static_map is not None and recording.robot is not None
+    config = StackConfig(tracker=TrackerConfig(cast_time=CAST_TIME))
     stack = PerceptionStack(
         recording.static_map, recording.models, recording.robot, RecordedDetector(recording),
-        T_map_base=start_pose(recording.metadata, recording.path),
+        T_map_base=start_pose(recording.metadata, recording.path), config=config,
     )  # fmt: skip
     interval = sys.getswitchinterval()
     try:
