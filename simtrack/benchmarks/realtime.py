@@ -2,9 +2,10 @@
 
 The workbench is run once and recorded: RGB-D at 30 Hz, lidar at 10 Hz, odometry, joints, and the oracle's detections
 with their latency. Then the feed is played: a frame arrives when the clock reaches its stamp. Scans and odometry wait
-for the stack; of images that arrived while it was busy only the newest is taken, the others are dropped. Latency runs
-from an image's arrival to the belief about it. Another process unpacks the log ahead, as a robot's drivers are others:
-its work is not the stack's, but takes its share of the machine.
+for the stack; of images that arrived while it was busy only the newest is taken, the others are dropped. The stack
+waits for no work beside the frames (`StackConfig.live`). Latency runs from an image's arrival to the belief about it.
+Another process unpacks the log ahead, as a robot's drivers are others: its work is not the stack's, but takes its share
+of the machine.
 """
 
 import gc
@@ -23,15 +24,11 @@ from simtrack.benchmarks.harness import Benchmark, Options
 from simtrack.contracts import NANOSECONDS, LidarScan, RgbdFrame, SensorFrame
 from simtrack.perception.localization.measurement import scan_end
 from simtrack.perception.pipeline import PerceptionStack, StackConfig
-from simtrack.perception.tracking.target import TrackerConfig
 from simtrack.recordings import Recording
 
 SWITCH_INTERVAL = 2e-4
 """Seconds after which a thread gives the interpreter to another one that waits for it: what is done beside the frames
 shall not keep the frames waiting (Python's own 5 ms are a sixth of a frame's time)."""
-CAST_TIME = 0.001
-"""Seconds that a cast for a new object is taken to last: what it does last beside the frames on two cores. The
-tracker's default, half of that, is what it lasts on a core of its own; here frames would wait for it."""
 WARM_UP = 2.0
 """Seconds of the feed that do not count: kernels are loaded, objects are born."""
 
@@ -97,10 +94,9 @@ def play(recording: Recording) -> Play:
     from simtrack.recordings import RecordedDetector
 
     assert recording.static_map is not None and recording.robot is not None
-    config = StackConfig(tracker=TrackerConfig(cast_time=CAST_TIME))
     stack = PerceptionStack(
         recording.static_map, recording.models, recording.robot, RecordedDetector(recording),
-        T_map_base=start_pose(recording.metadata, recording.path), config=config,
+        T_map_base=start_pose(recording.metadata, recording.path), config=StackConfig.live(),
     )  # fmt: skip
     interval = sys.getswitchinterval()
     try:
