@@ -118,7 +118,14 @@ def test_every_package_that_is_imported_is_a_declared_dependency() -> None:
     """A machine that has more installed would hide a missing one."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    lines = [*project["dependencies"], *extras["viz"], *extras["bench"], *extras["distributed"], *extras["train"], *extras["openvino"]]
+    lines = [
+        *project["dependencies"],
+        *extras["viz"],
+        *extras["bench"],
+        *extras["distributed"],
+        *extras["train"],
+        *extras["openvino"],
+    ]
     declared = {re.split(r"[\[<>=~!; ]", line)[0] for line in lines}
     modules = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in declared} | {"simtrack"}
     modules |= {"llvmlite", "markupsafe", "pydantic_core", "pybullet_utils"}  # of numba, jinja2, pydantic, pybullet

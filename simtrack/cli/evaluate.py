@@ -8,27 +8,71 @@ import tyro
 
 
 def evaluate(
-    what: Annotated[Literal["reconstruction"], tyro.conf.Positional],
+    what: Annotated[Literal["reconstruction", "detector"], tyro.conf.Positional],
     rooms: str = "all",
     entities: Literal["true", "partial", "both"] = "both",
     stages: Literal["graph", "models", "physics"] = "physics",
     out: Path = Path("reports"),
     work: Path = Path("runs/evaluate-reconstruction"),
     workers: int | None = None,
+    data: Path | None = None,
+    detector: str = "keypoints",
+    count: int | None = None,
 ) -> int:
-    """Reconstruct many rooms and compare with the truth: contact graph, CAD models, physics.
+    """Measure a part against the truth: reconstruction of many rooms, or the detector on labelled images.
 
-    The same command carries on where a stopped one was; rooms that the same code has done are not done again.
+    Reconstruction: contact graph, CAD models, physics. The same command carries on where a stopped one was; rooms that
+    the same code has done are not done again.
 
     Args:
         what: What is evaluated.
-        rooms: all evaluation rooms, or some: 101,102 or 1-20 or kitchen:2.
+        rooms: Reconstruction: all evaluation rooms, or some: 101,102 or 1-20 or kitchen:2.
         entities: Complete meshes, or partial ones as a camera sees them on a walk, or both.
         stages: How far to go: the contact graph alone, CAD models too, or the check of physics as well.
-        out: Folder for reconstruction.json and reconstruction.txt.
+        out: Folder for the results, WHAT.json and WHAT.txt.
         work: Folder where rooms are kept as they are done.
         workers: Processes; one a core if not given.
+        data: Detector: folder of a generated data set with the format bop that it was not trained on.
+        detector: keypoints (the networks that come along), or a folder that `simtrack train detector` wrote.
+        count: Images at most.
     """
+    if what == "detector":
+        return _detector(data, detector, count, out)
+    return _reconstruction(rooms, entities, stages, out, work, workers)
+
+
+def _detector(data: Path | None, detector: str, count: int | None, out: Path) -> int:
+    from simtrack.cli import console
+    from simtrack.errors import InvalidValueError
+    from simtrack.evaluation.detector import evaluate_detector, write_scores
+    from simtrack.perception.detection.keypoint_detector import KeypointDetector
+    from simtrack.perception.detection.loading import KEYPOINTS
+    from simtrack.training.source import open_source
+
+    if data is None:
+        raise InvalidValueError("data", None, "the folder of a generated data set")
+    if count is not None and count < 1:
+        raise InvalidValueError("count", count, "1 or more")
+    source = open_source(data)
+    models = {model.name: model for model in source.models}
+    opened = KeypointDetector(models, None if detector == KEYPOINTS else Path(detector))
+    with console.ProgressLine("evaluate detector", "compiling") as line:
+        scores = evaluate_detector(source, opened, count, lambda done, of: line.show(f"{done}/{of} images", done / of))
+    metrics = scores.metrics()
+    rows = [(n, f"({m.reason})" if m.value is None else f"{m.value:.4g}", m.unit) for n, m in metrics.items()]
+    console.show_table(("figure", "value", "unit"), rows, right=(1,))
+    console.show_written(out, write_scores(metrics, len(scores.found), data.name, out))
+    return 0
+
+
+def _reconstruction(
+    rooms: str,
+    entities: Literal["true", "partial", "both"],
+    stages: Literal["graph", "models", "physics"],
+    out: Path,
+    work: Path,
+    workers: int | None,
+) -> int:
     from simtrack.cli import console
     from simtrack.errors import InvalidValueError
     from simtrack.evaluation.reconstruction import ENTITIES
@@ -48,7 +92,7 @@ def evaluate(
     kinds = ENTITIES if entities == "both" else (entities,)
     tasks = [RoomTask(seed, kitchen, kind, stages) for seed, kitchen in parse_rooms(rooms) for kind in kinds]
     size = min(workers or len(os.sched_getaffinity(0)), len(tasks))
-    with console.ProgressLine(f"evaluate {what}", "looking for rooms that are done") as line:
+    with console.ProgressLine("evaluate reconstruction", "looking for rooms that are done") as line:
         try:
             results = evaluate_rooms(
                 tasks, work, size, lambda done, of, state: line.show(f"{done}/{of} · {state}", done / of)

@@ -38,7 +38,9 @@ def run(
         agent: What decides where the robot looks and drives: explorer, fixed-gaze, route; the scene's own if not given.
         tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
         localizer: A localizer of yours, package.module:Class, or oracle: one that knows the truth.
-        detector: What detects objects in images: oracle, or package.module:Class.
+        detector: What detects objects in images: oracle (knows the truth, and errs like a trained network), keypoints
+            (the networks that come along), a folder that `simtrack train detector` wrote, a YOLOv8-pose .onnx file, or
+            package.module:Class.
         stage_limit: Seconds that a stage of yours has for a frame; after that the frame counts as missed.
         renderer: mujoco needs OpenGL (EGL), embree needs none.
         overwrite: Replace the results in an existing folder.

@@ -22,6 +22,7 @@ from simtrack.contracts import (
     Agent,
     Belief,
     Command,
+    Detector,
     Float64,
     JointState,
     RgbdFrame,
@@ -39,6 +40,7 @@ from simtrack.evaluation.start_up import warm_up
 from simtrack.evaluation.tracking import TrackingEvaluator
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.objects import ObjectModel
+from simtrack.perception.detection.loading import make_image_detector
 from simtrack.perception.foreign import StageContext, Watch
 from simtrack.perception.pipeline import PerceptionStack
 from simtrack.simulation.agents import AgentContext, make_agent
@@ -203,7 +205,7 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
             simulation.static_map,
             simulation.models,
             simulation.robot,
-            foreign.detector or OracleDetector(simulation.truth, simulation.models, config.seed, config.oracle),
+            foreign.detector or _own_detector(config, simulation),
             T_map_base=simulation.start,
             config=config.stack,
             localizer=OracleLocalizer(simulation.truth) if config.localizer == ORACLE else foreign.localizer,
@@ -211,6 +213,12 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
         )
         exits.callback(stack.close)
         yield Loop(simulation, stack, make_agent(agent, context), start, foreign.watches, config.script)
+
+
+def _own_detector(config: RunConfig, simulation: Simulation) -> Detector:
+    if config.detector == ORACLE:
+        return OracleDetector(simulation.truth, simulation.models, config.seed, config.oracle)
+    return make_image_detector(config.detector, simulation.models)
 
 
 @dataclass(slots=True)

@@ -58,7 +58,7 @@ def foreign_stages(config: RunConfig, context: StageContext) -> Iterator[Foreign
             built = cast(Localizer, build_stage("localizer", config.localizer, context))
             localizer = GuardedLocalizer(built, context.T_map_base, limit)
             exits.callback(localizer.close)
-        if config.detector != ORACLE:
+        if "detector" in config.foreign:
             detector = GuardedDetector(cast(Detector, build_stage("detector", config.detector, context)), limit)
             exits.callback(detector.close)
         yield ForeignStages(tracker, localizer, detector)

@@ -8,6 +8,8 @@ from pathlib import Path
 import simtrack
 from simtrack.contracts import Command
 from simtrack.errors import InvalidValueError, UnknownNameError
+from simtrack.perception.detection.loading import ALLOWED as IMAGE_DETECTORS
+from simtrack.perception.detection.loading import check_image_detector, is_image_detector
 from simtrack.perception.foreign import check_stage
 from simtrack.perception.foreign.guards import DEFAULT_LIMIT
 from simtrack.perception.pipeline import StackConfig
@@ -19,7 +21,7 @@ ORACLE = "oracle"
 """The detector that knows the truth, and errs like a trained network; the localizer that knows it and does not err."""
 RENDERERS = ("mujoco", "embree")
 DEFAULT_AGENT, FIXED_GAZE = "explorer", "fixed-gaze"
-_PACKAGES = ("mujoco", "numpy", "numba", "embreex", "opencv-python-headless", "scipy", "pyoxigraph")
+_PACKAGES = ("mujoco", "numpy", "numba", "embreex", "opencv-python-headless", "scipy", "pyoxigraph", "onnxruntime")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,8 @@ class RunConfig:
     agent: str | None = None
     """The scene's own, or the explorer, if None."""
     detector: str = ORACLE
-    """The oracle, or ``package.module:Class``."""
+    """The oracle, one of simtrack's own that look at images (`simtrack.perception.detection.loading`), or
+    ``package.module:Class``."""
     oracle: OracleDetectorConfig = field(default_factory=OracleDetectorConfig)
     """How the oracle detector errs."""
     tracker: str | None = None
@@ -66,8 +69,10 @@ class RunConfig:
         ):
             if name not in known:
                 raise UnknownNameError(kind, name, known)
-        if ":" not in self.detector and self.detector != ORACLE:
-            raise UnknownNameError("detector", self.detector, (ORACLE, "package.module:Class"))
+        if is_image_detector(self.detector):
+            check_image_detector(self.detector)
+        elif ":" not in self.detector and self.detector != ORACLE:
+            raise UnknownNameError("detector", self.detector, (ORACLE, *IMAGE_DETECTORS, "package.module:Class"))
         if not 0.0 < self.stage_limit <= 3600.0:
             raise InvalidValueError("stage_limit", self.stage_limit, "more than 0 and at most 3600 seconds")
         for stage, given in self.foreign.items():
@@ -82,6 +87,8 @@ class RunConfig:
     def foreign(self) -> dict[str, str]:
         """Stage -> what was given for it, of those that are not simtrack's."""
         given = {"tracker": self.tracker, "localizer": self.localizer, "detector": self.detector}
+        if is_image_detector(self.detector):
+            del given["detector"]
         return {stage: name for stage, name in given.items() if name is not None and name != ORACLE}
 
     @property

@@ -52,7 +52,7 @@ class BoxTask:
         return shown.contiguous(memory_format=torch.channels_last), *rest
 
     def sample(self, record: Any, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-        """Input, heat (classes, h, w), where heat is learned (h, w), sides (4, h, w) in cells, and their weight (h, w)."""
+        """Input, heat (classes, h, w), where it is learned (h, w), sides (4, h, w) in cells, their weight (h, w)."""
         rgb, depth = np.asarray(record["rgb"]), np.asarray(record["depth"], np.float32)
         boxes, classes, visible = record["boxes"].astype(float), record["classes"], record["visible"]
         if rng.random() < ZOOMED:
@@ -72,7 +72,9 @@ class BoxTask:
         positive = -peak * (1 - probability) ** 2 * torch.log(probability)
         negative = -(1 - peak) * (1 - heat) ** 4 * probability**2 * torch.log(1 - probability)
         focal = ((positive + negative) * learned[:, None]).sum() / peak.sum().clamp(min=1)
-        return focal + 2.0 * ((1.0 - _generalised_overlap(torch.exp(distances), sides)) * weight).sum() / weight.sum().clamp(min=1)
+        return focal + 2.0 * (
+            (1.0 - _generalised_overlap(torch.exp(distances), sides)) * weight
+        ).sum() / weight.sum().clamp(min=1)
 
     def validate(self, network: BoxNetwork) -> dict[str, float]:
         """Average precision at an overlap of 0.5 of objects that are seen by more than half."""
@@ -118,7 +120,9 @@ def targets(boxes: Float64, classes: np.ndarray, visible: np.ndarray, count: int
     return heat, learned, sides, weight
 
 
-def _zoomed(rgb: np.ndarray, depth: np.ndarray, boxes: Float64, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Float64]:
+def _zoomed(
+    rgb: np.ndarray, depth: np.ndarray, boxes: Float64, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, Float64]:
     """The same from nearer or farther, and shifted; what comes into view has one colour and no depth."""
     import cv2
 
@@ -140,5 +144,3 @@ def _generalised_overlap(a: Tensor, b: Tensor) -> Tensor:
     hull = (outer[:, 0] + outer[:, 2]) * (outer[:, 1] + outer[:, 3])
     union = (a[:, 0] + a[:, 2]) * (a[:, 1] + a[:, 3]) + (b[:, 0] + b[:, 2]) * (b[:, 1] + b[:, 3]) - common
     return common / union - (hull - union) / hull
-
-

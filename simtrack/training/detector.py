@@ -4,10 +4,16 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from simtrack.errors import DatasetError, InvalidValueError
-from simtrack.training.shards import CROPS, IMAGES, Shards, Source, open_source, prepare
+from simtrack.training.shards import CROPS, IMAGES, Shards, prepare
+from simtrack.training.source import Source, open_source
+
+if TYPE_CHECKING:
+    from simtrack.training.box_task import BoxTask
+    from simtrack.training.keypoint_task import KeypointTask
+    from simtrack.training.loop import Progress
 
 Part: TypeAlias = Literal["keypoints", "boxes"]
 PARTS: tuple[Part, ...] = ("keypoints", "boxes")
@@ -52,7 +58,7 @@ def prepared(config: TrainingConfig, told: Callable[[int, int], None] | None = N
     return source
 
 
-def train_part(part: Part, config: TrainingConfig, told: "Callable[[object], None] | None" = None) -> Path:
+def train_part(part: Part, config: TrainingConfig, told: "Callable[[Progress], None] | None" = None) -> Path:
     """Train one network on one thread, or carry on, and write it as ONNX; the data set is `prepared` before.
 
     Raises:
@@ -71,7 +77,7 @@ def train_part(part: Part, config: TrainingConfig, told: "Callable[[object], Non
     return path
 
 
-def make_task(part: Part, source: Source, shards: Path):  # noqa: ANN201
+def make_task(part: Part, source: Source, shards: Path) -> "BoxTask | KeypointTask":
     """The task of one network."""
     from simtrack.training.box_task import BoxTask
     from simtrack.training.keypoint_task import KeypointTask

@@ -85,8 +85,9 @@ class KeypointTask:
         entropy = -(target * functional.log_softmax(logits, -1)).sum(-1)
         loss = (entropy * inside).sum() / inside.sum().clamp(min=1)
         known = points[:, 3:]
-        loss = loss + POINT_WEIGHT * (functional.smooth_l1_loss(answered[:, :3], points[:, :3], reduction="none", beta=0.1)
-                                      * known).sum() / known.sum().clamp(min=1)
+        loss = loss + POINT_WEIGHT * (
+            functional.smooth_l1_loss(answered[:, :3], points[:, :3], reduction="none", beta=0.1) * known
+        ).sum() / known.sum().clamp(min=1)
         mask = functional.binary_cross_entropy_with_logits(answered[:, 3:], known)
         return loss + 0.3 * mask + PRESENT_WEIGHT * functional.binary_cross_entropy_with_logits(there, present)
 

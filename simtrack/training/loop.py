@@ -2,7 +2,6 @@
 
 import copy
 import json
-import os
 import pickle
 import time
 from collections.abc import Callable
@@ -148,8 +147,9 @@ def train(
         if told is not None and (step % 50 == 0 or over):
             told(progress)
         if over or time.monotonic() - saved_at > saved_every:
-            _save(folder / CHECKPOINT, {"step": step, "seconds": seconds, "figures": figures, "loss": running,
-                  "network": network.state_dict(), "averaged": averaged.state_dict(), "optimizer": optimizer.state_dict()})  # fmt: skip
+            state = {"step": step, "seconds": seconds, "figures": figures, "loss": running}
+            parts = {"network": network, "averaged": averaged, "optimizer": optimizer}
+            _save(folder / CHECKPOINT, state | {name: part.state_dict() for name, part in parts.items()})
             saved_at = time.monotonic()
     return averaged
 
@@ -209,7 +209,7 @@ def _loaded(path: Path) -> dict[str, Any]:
 def _save(path: Path, state: dict[str, Any]) -> None:
     part = path.with_suffix(".part")
     torch.save(state, part)
-    os.replace(part, path)
+    part.replace(path)
 
 
 def _log(path: Path, progress: Progress) -> None:

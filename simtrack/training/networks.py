@@ -37,7 +37,9 @@ class Residual(nn.Module):
 
 def _stage(channels_in: int, channels_out: int, blocks: int) -> nn.Sequential:
     """Half the resolution, then residual blocks."""
-    return nn.Sequential(convolved(channels_in, channels_out, stride=2), *(Residual(channels_out) for _ in range(blocks)))
+    return nn.Sequential(
+        convolved(channels_in, channels_out, stride=2), *(Residual(channels_out) for _ in range(blocks))
+    )
 
 
 class BoxNetwork(nn.Module):

@@ -36,8 +36,10 @@ def average_precision(
             taken: set[int] = set()
             for box in sorted((b for b in boxes if b.class_index == c), key=lambda b: -b.score):
                 # Objects that count are matched before those that are let pass.
-                matches = [(visible[k] > least_visible, overlap(box.corners, places[k]), k) for k in own if k not in taken]
-                counted, shared, k = max((m for m in matches if m[1] >= least_overlap), default=(True, 0.0, -1))
+                matches = [
+                    (visible[k] > least_visible, overlap(box.corners, places[k]), k) for k in own if k not in taken
+                ]
+                counted, _, k = max((m for m in matches if m[1] >= least_overlap), default=(True, 0.0, -1))
                 if k >= 0:
                     taken.add(k)
                 if counted or k < 0:

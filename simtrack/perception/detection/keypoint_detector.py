@@ -118,14 +118,18 @@ class KeypointDetector:
         if frame.rgb is None:
             return DetectionResult(frame.stamp, available, (), Status.NO_DATA)
         found = self.boxes(frame.rgb, frame.depth)
-        return DetectionResult(frame.stamp, available, self.keypoints(found, frame.rgb, frame.depth, frame.intrinsics.fx))
+        return DetectionResult(
+            frame.stamp, available, self.keypoints(found, frame.rgb, frame.depth, frame.intrinsics.fx)
+        )
 
     def boxes(self, rgb: Uint8, depth: Float32) -> list[Box]:
         """Boxes of the wanted objects in an image, in its own pixels, best first."""
         small = shown_image(*reduced(rgb, depth, *self._size))
         heat, sides = self._boxes.run({"image": small[None]})
         scale = np.tile(np.array(depth.shape[::-1]) / np.array(self._size), 2)
-        wanted = (box for box in decoded_boxes(heat[0], sides[0], self.config.box_score) if self._diameters[box.class_index])
+        wanted = (
+            box for box in decoded_boxes(heat[0], sides[0], self.config.box_score) if self._diameters[box.class_index]
+        )
         return [Box(box.class_index, (box.corners + 0.5) * scale - 0.5, box.score) for box in wanted]
 
     def keypoints(self, boxes: Sequence[Box], rgb: Uint8, depth: Float32, focal: float) -> tuple[Detection, ...]:

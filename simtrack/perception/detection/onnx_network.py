@@ -23,7 +23,9 @@ RUNTIMES: tuple[Runtime, ...] = ("auto", "onnxruntime", "openvino")
 class Runner(Protocol):
     """Answers inputs by name with all outputs in the order of the file."""
 
-    def __call__(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]: ...
+    def __call__(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Ask."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
