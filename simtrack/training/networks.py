@@ -7,7 +7,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from simtrack.perception.detection.boxes import STRIDE
 from simtrack.perception.detection.views import CHANNELS
+from simtrack.training.keypoint_samples import SIZE
 
 KEYPOINTS = 9
 
@@ -48,7 +50,7 @@ class BoxNetwork(nn.Module):
     CenterNet's heat maps (Zhou, Wang, Kraehenbuehl: Objects as Points, 2019) over one level of a feature pyramid.
     """
 
-    stride = 8
+    stride = STRIDE
 
     def __init__(self, classes: int) -> None:
         super().__init__()
@@ -77,7 +79,7 @@ class KeypointNetwork(nn.Module):
     which point of the object each cell of 4 pixels shows, which teaches it shapes.
     """
 
-    size = 64
+    size = SIZE
 
     def __init__(self, classes: int, bins: int) -> None:
         super().__init__()
