@@ -1,6 +1,7 @@
 """Networks as ONNX: 16-bit weights, and in the file's metadata what they were trained to find."""
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,14 @@ def _export(
     import onnx
 
     part = path.with_suffix(".part.onnx")
-    torch.onnx.export(
-        network.eval().to(memory_format=torch.contiguous_format),  # type: ignore[call-overload]
-        inputs, str(part), input_names=names_in, output_names=names_out, dynamic_axes=free, opset_version=OPSET,
-        dynamo=False,
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        # The exporter that is to follow needs another package, and its graphs are larger.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(
+            network.eval().to(memory_format=torch.contiguous_format),  # type: ignore[call-overload]
+            inputs, str(part), input_names=names_in, output_names=names_out, dynamic_axes=free, opset_version=OPSET,
+            dynamo=False,
+        )  # fmt: skip
     model = onnx.load(str(part))
     halve_weights(model)
     entry = model.metadata_props.add()

@@ -47,7 +47,7 @@ def record_of(rgb: np.ndarray, depth: np.ndarray, T: Float64, box: Float64) -> n
 
 def pose(seed: int) -> Float64:
     rng = np.random.default_rng(seed)
-    return transform(exp_so3(rng.uniform(-3, 3, 3)), [*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.7, 1.3)])
+    return transform(exp_so3(rng.uniform(-3, 3, 3)), [*rng.uniform(-0.15, 0.15, 2), rng.uniform(0.7, 1.3)])
 
 
 @settings(max_examples=12, deadline=None)
@@ -69,10 +69,10 @@ def test_a_keypoint_is_told_where_its_pixel_is_shown(seed: int, keypoint: int) -
         patch.setattr(keypoint_samples, "OTHER_CLASS", 0.0)
         shown = sample(record, [brick], rng)
     told = shown.keypoints[keypoint] * SIZE - 0.5
-    if not (4.0 < told).all() or not (told < SIZE - 5.0).all():
+    if not (told > 4.0).all() or not (told < SIZE - 5.0).all():
         return
-    image = shown.shown[0].astype(float) + 1.0
-    centre = cv2.moments((image * (image > 0.3)).astype(np.float32))
+    # Brighter than the grey outside of the image.
+    centre = cv2.moments(np.maximum(shown.shown[0] - 0.1, 0.0).astype(np.float32))
     seen = np.array([centre["m10"], centre["m01"]]) / centre["m00"]
     assert np.linalg.norm(seen - told) < 0.35  # a patch's pixel, as the window is drawn from stored ones
 

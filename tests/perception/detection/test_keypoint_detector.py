@@ -1,0 +1,167 @@
+"""The detector around its networks: what it asks them, what it makes of their answers, which files it refuses."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from simtrack.contracts import NANOSECONDS, CameraIntrinsics, Detector, RgbdFrame, Status
+from simtrack.errors import FileFormatError, InvalidValueError
+from simtrack.geometry.meshes import box_mesh
+from simtrack.geometry.transforms import exp_so3, transform
+from simtrack.objects import ObjectModel
+from simtrack.objects.model import build_model, half_turns
+from simtrack.perception.detection import keypoint_detector
+from simtrack.perception.detection.bins import BEFORE, BINS, position_of
+from simtrack.perception.detection.boxes import STRIDE
+from simtrack.perception.detection.keypoint_detector import KeypointDetector, KeypointDetectorConfig
+from simtrack.perception.detection.loading import check_image_detector, is_image_detector, make_image_detector
+from simtrack.perception.detection.onnx_network import OnnxNetwork, open_network
+from simtrack.perception.detection.pnp import project_points, solve_pose
+from simtrack.perception.detection.views import WINDOW, window_about
+
+CAMERA = CameraIntrinsics(640, 480, 577.0, 577.0, 319.5, 239.5)
+SMALL = (320, 240)
+
+
+def brick(name: str = "brick", size: tuple[float, float, float] = (0.2, 0.12, 0.08)) -> ObjectModel:
+    mesh = box_mesh(size, (200, 80, 40))
+    return build_model(
+        name=name, semantic_class="component", mesh=mesh, visual=mesh, collision=[mesh], mass=1.0, friction=0.5,
+        symmetries=half_turns(), trackable=True,
+    )  # fmt: skip
+
+
+ABOUT: dict[str, dict[str, Any]] = {
+    "boxes.onnx": {"kind": "boxes", "stride": STRIDE, "width": SMALL[0], "height": SMALL[1]},
+    "keypoints.onnx": {"kind": "keypoints", "size": 64, "window": WINDOW, "bins": BINS, "before": BEFORE},
+}
+CLASSES = {"classes": ["brick", "tile"], "extents": [[0.2, 0.12, 0.08], [0.1, 0.1, 0.02]]}
+
+
+class Answers:
+    """Networks that know the answer for one object of the first class."""
+
+    def __init__(self, T_camera_object: np.ndarray, present: float = 6.0) -> None:
+        self.keypoints = project_points(T_camera_object, brick().keypoints, CAMERA)
+        self.box = np.concatenate([self.keypoints.min(axis=0), self.keypoints.max(axis=0)])
+        self.present = present
+
+    def boxes(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        assert inputs["image"].shape == (1, 5, SMALL[1], SMALL[0])
+        h, w = SMALL[1] // STRIDE, SMALL[0] // STRIDE
+        u0, v0, u1, v1 = ((self.box + 0.5) / 2 - 0.5 + 0.5) / STRIDE - 0.5  # half the size, then cells
+        u, v = round((u0 + u1) / 2), round((v0 + v1) / 2)
+        heat, sides = np.full((1, 2, h, w), -9.0, np.float32), np.zeros((1, 4, h, w), np.float32)
+        heat[0, 0, v, u] = 4.0
+        sides[0, :, v, u] = np.log([u - u0, v - v0, u1 - u, v1 - v])
+        return [heat, sides]
+
+    def windows(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        assert inputs["window"].shape == (1, 5, 64, 64)
+        assert inputs["told"].shape == (1, 4)
+        window = window_about(self.box)
+        places = (self.keypoints - [window.u, window.v]) / window.side + 0.5
+        position = position_of(places)
+        logits = -0.5 * ((np.arange(BINS) - position[..., None]) / 1.3) ** 2
+        return [logits[None].astype(np.float32), np.array([self.present], np.float32)]
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Any]]:
+    """Metadata of the networks' files, to be spoiled, behind which `Answers` stand."""
+    about = {name: values | CLASSES for name, values in ABOUT.items()}
+    answers = Answers(pose())
+    about["answers"] = {"instance": answers}
+
+    def open_network(path: Path, runtime: str) -> OnnxNetwork:
+        boxes = path.name == "boxes.onnx"
+        inputs = {"image": (1, 5, *SMALL[::-1])} if boxes else {"window": ("n", 5, 64, 64), "told": ("n", 4)}
+        outputs = ("heat", "sides") if boxes else ("coordinates", "present")
+        run = answers.boxes if boxes else answers.windows
+        return OnnxNetwork(path, inputs, outputs, {"simtrack": json.dumps(about[path.name])}, run, runtime)
+
+    monkeypatch.setattr(keypoint_detector, "open_network", open_network)
+    return about
+
+
+def pose() -> np.ndarray:
+    return transform(exp_so3([0.5, -0.7, 0.3]), (0.1, -0.05, 1.1))
+
+
+def models() -> dict[str, ObjectModel]:
+    return {"brick": brick(), "tile": brick("tile", (0.1, 0.1, 0.02))}
+
+
+def frame(rgb: np.ndarray | None) -> RgbdFrame:
+    return RgbdFrame(7 * NANOSECONDS, np.ones((480, 640), np.float32), rgb, CAMERA, np.eye(4))
+
+
+def test_right_answers_become_the_right_pose(opened: dict[str, Any]) -> None:
+    detector = KeypointDetector(models(), Path("somewhere"), KeypointDetectorConfig(latency=0.3))
+    assert isinstance(detector, Detector)
+    result = detector.detect(frame(np.zeros((480, 640, 3), np.uint8)))
+    assert (result.stamp, result.available) == (7 * NANOSECONDS, 7_300_000_000)
+    (detection,) = result.detections
+    assert detection.class_name == "brick"
+    answers = opened["answers"]["instance"]
+    assert np.allclose(detection.box, answers.box, atol=1e-3)
+    assert np.abs(detection.keypoints - answers.keypoints).max() < 0.3  # pixels
+    (best, *_) = solve_pose(detection, models()["brick"], CAMERA, 0)
+    assert np.linalg.norm(best.T_camera_object[:3, 3] - pose()[:3, 3]) < 0.005
+
+
+def test_boxes_in_which_nothing_is_are_dropped(opened: dict[str, Any]) -> None:
+    opened["answers"]["instance"].present = -3.0
+    assert KeypointDetector(models(), Path("x")).detect(frame(np.zeros((480, 640, 3), np.uint8))).detections == ()
+
+
+def test_objects_that_nobody_asked_for_are_let_be(opened: dict[str, Any]) -> None:
+    detector = KeypointDetector({"tile": models()["tile"]}, Path("x"))
+    assert detector.detect(frame(np.zeros((480, 640, 3), np.uint8))).detections == ()
+
+
+def test_without_colour_there_is_no_data(opened: dict[str, Any]) -> None:
+    assert KeypointDetector(models(), Path("x")).detect(frame(None)).status is Status.NO_DATA
+
+
+@pytest.mark.parametrize(
+    ("file", "field", "value", "told"),
+    [
+        ("boxes.onnx", "kind", "keypoints", "expected 'boxes'"),
+        ("boxes.onnx", "width", 0, "16 to 4096"),
+        ("keypoints.onnx", "bins", 10, "expected 96"),
+        ("keypoints.onnx", "classes", ["tile", "brick"], "keypoints would differ"),
+        ("keypoints.onnx", "extents", [[0.2, 0.12, 0.16], [0.1, 0.1, 0.02]], "'brick' was trained with a box of"),
+        ("boxes.onnx", "classes", ["brick", "plate"], "knows nothing of tile; it was trained to find brick, plate"),
+        ("keypoints.onnx", "classes", [], "expected names"),
+    ],
+)
+def test_other_networks_are_refused(opened: dict[str, Any], file: str, field: str, value: object, told: str) -> None:
+    opened[file][field] = value
+    with pytest.raises(FileFormatError, match=told) as caught:
+        KeypointDetector(models(), Path("x"))
+    assert caught.value.path.name == file
+
+
+def test_files_that_are_no_networks_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"boxes\.onnx: no such file"):
+        make_image_detector(str(tmp_path), models())
+    with pytest.raises(FileFormatError, match="simtrack train detector"):
+        check_image_detector(str(tmp_path))
+    (tmp_path / "boxes.onnx").write_bytes(b"not a network")
+    with pytest.raises(FileFormatError, match="no ONNX network"):
+        open_network(tmp_path / "boxes.onnx")
+    with pytest.raises(InvalidValueError, match="auto, onnxruntime, openvino"):
+        open_network(tmp_path / "boxes.onnx", "tensorrt")  # type: ignore[arg-type]
+    assert [is_image_detector(name) for name in ("keypoints", "a.onnx", str(tmp_path), "oracle", "m:C")] == [
+        True, True, True, False, False,
+    ]  # fmt: skip
+
+
+def test_settings_are_checked() -> None:
+    with pytest.raises(InvalidValueError, match="latency"):
+        KeypointDetectorConfig(latency=-1.0)
