@@ -90,7 +90,7 @@ def _canonical(T_camera_object: Float64, model: ObjectModel, turn: float) -> Flo
         return T_camera_object
     c, s = np.cos(turn), np.sin(turn)
     upright = transform(np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
-    return upright.T @ canonical_view(upright @ T_camera_object, model)
+    return np.asarray(upright.T @ canonical_view(upright @ T_camera_object, model), np.float64)
 
 
 def _turned(window: Window, size: int, turn: float) -> Float64:

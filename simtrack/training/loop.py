@@ -179,9 +179,9 @@ def restored_network(task: Task, folder: Path) -> nn.Module:
 
 def _average(averaged: nn.Module, network: nn.Module, decay: float) -> None:
     with torch.no_grad():
-        ours, theirs = list(averaged.state_dict().values()), list(network.state_dict().values())
-        floats = [(a, b) for a, b in zip(ours, theirs, strict=True) if a.is_floating_point()]
-        torch._foreach_lerp_([a for a, _ in floats], [b for _, b in floats], 1.0 - decay)
+        for ours, theirs in zip(averaged.state_dict().values(), network.state_dict().values(), strict=True):
+            if ours.is_floating_point():
+                ours.lerp_(theirs, 1.0 - decay)
 
 
 def _restored(path: Path, network: nn.Module, averaged: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:

@@ -50,5 +50,5 @@ def average_precision(
             recall, precision = hits / total, hits / np.arange(1, len(hits) + 1)
             envelope = np.maximum.accumulate(precision[::-1])[::-1]
             steps = np.searchsorted(recall, np.linspace(0.0, 1.0, 101), side="left")
-            values[c] = float(np.mean([envelope[s] if s < len(envelope) else 0.0 for s in steps]))
+            values[c] = float(np.append(envelope, 0.0)[steps].mean())
     return values

@@ -108,7 +108,7 @@ def test_both_networks_train_and_answer_alike_in_their_files(tmp_path: Path, mon
             detector.make_task(part, source, tmp_path / "out" / "shards"), tmp_path / "out" / part
         )
         rng = np.random.default_rng(0)
-        shapes = [[3 if isinstance(size, str) else size for size in shape] for shape in network.inputs.values()]
+        shapes = [[size if isinstance(size, int) else 3 for size in shape] for shape in network.inputs.values()]
         given = [rng.standard_normal(shape).astype(np.float32) for shape in shapes]
         answered = network.run(dict(zip(network.inputs, given, strict=True)))
         with torch.no_grad():

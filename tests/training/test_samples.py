@@ -47,7 +47,7 @@ def record_of(rgb: np.ndarray, depth: np.ndarray, T: Float64, box: Float64) -> n
 
 def pose(seed: int) -> Float64:
     rng = np.random.default_rng(seed)
-    return transform(exp_so3(rng.uniform(-3, 3, 3)), [*rng.uniform(-0.15, 0.15, 2), rng.uniform(0.7, 1.3)])
+    return transform(exp_so3(rng.uniform(-3, 3, 3)), tuple(rng.uniform((-0.15, -0.15, 0.7), (0.15, 0.15, 1.3))))
 
 
 @settings(max_examples=12, deadline=None)

@@ -21,9 +21,9 @@ def position_of(places: Coordinates) -> Coordinates:
     return (places + BEFORE) * (BINS / (1.0 + 2.0 * BEFORE)) - 0.5  # type: ignore[operator]
 
 
-def place_of(positions: Float64) -> Float64:
+def place_of(positions: Coordinates) -> Coordinates:
     """Inverse of `position_of`."""
-    return (positions + 0.5) * ((1.0 + 2.0 * BEFORE) / BINS) - BEFORE
+    return (positions + 0.5) * ((1.0 + 2.0 * BEFORE) / BINS) - BEFORE  # type: ignore[operator]
 
 
 def decoded(logits: np.ndarray) -> tuple[Float64, Float64]:

@@ -2,10 +2,10 @@
 
 import importlib.util
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -20,12 +20,8 @@ Runtime: TypeAlias = Literal["auto", "onnxruntime", "openvino"]
 RUNTIMES: tuple[Runtime, ...] = ("auto", "onnxruntime", "openvino")
 
 
-class Runner(Protocol):
-    """Answers inputs by name with all outputs in the order of the file."""
-
-    def __call__(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        """Ask."""
-        ...
+Runner: TypeAlias = Callable[[Mapping[str, np.ndarray]], list[np.ndarray]]
+"""Answers inputs by name with all outputs in the order of the file."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,7 +50,7 @@ class Pyramid:
 
         self._levels = [rgb]
         for _ in range(levels - 1):
-            self._levels.append(np.asarray(cv2.pyrDown(self._levels[-1])))
+            self._levels.append(np.asarray(cv2.pyrDown(self._levels[-1]), np.uint8))
 
     def cut(self, pixels: Float64, size: int) -> Uint8:
         """(size, size, 3), colours at image pixels ``pixels @ (i, j, 1)``; grey outside of the image.

@@ -89,7 +89,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Any]]:
 
 
 def pose() -> np.ndarray:
-    return transform(exp_so3([0.5, -0.7, 0.3]), (0.1, -0.05, 1.1))
+    return transform(exp_so3(np.array([0.5, -0.7, 0.3])), (0.1, -0.05, 1.1))
 
 
 def models() -> dict[str, ObjectModel]:
