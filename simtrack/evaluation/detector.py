@@ -7,7 +7,7 @@ from time import process_time
 
 import numpy as np
 
-from simtrack.contracts import Detection, Float64, RgbdFrame
+from simtrack.contracts import CameraIntrinsics, Detection, Float64, RgbdFrame
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio
 from simtrack.evaluation.pose_errors import PoseScorer
 from simtrack.objects import ObjectModel
@@ -137,7 +137,7 @@ def _score(scores: DetectorScores, steps: "_PoseSteps", detector: KeypointDetect
         model = scores.models[label.class_index]
         detection = _match(label, model.name, detections)
         if detection is not None:
-            T_alike = nearest_alike(detection.keypoints, label.T_camera_object, model, frame)
+            T_alike = nearest_alike(detection.keypoints, label.T_camera_object, model, image.intrinsics)
             errors = detection.keypoints - project_points(T_alike, model.keypoints, image.intrinsics)
             size = image.intrinsics.fx * model.diameter / label.T_camera_object[2, 3]
             distances = np.linalg.norm(errors, axis=1)
@@ -150,14 +150,16 @@ def _score(scores: DetectorScores, steps: "_PoseSteps", detector: KeypointDetect
             scores.poses[step].append(errors)
 
 
-def nearest_alike(keypoints: Float64, T_camera_object: Float64, model: ObjectModel, frame: RgbdFrame) -> Float64:
+def nearest_alike(
+    keypoints: Float64, T_camera_object: Float64, model: ObjectModel, camera: CameraIntrinsics
+) -> Float64:
     """(4, 4): of the poses that look alike, the one whose keypoints are nearest to detected ones (9, 2)."""
     alike = T_camera_object @ model.symmetries.poses(np.deg2rad(5.0))
     known = np.isfinite(keypoints).all(axis=1)
     if not known.any():
         return T_camera_object
     distances = [
-        np.mean(np.sum((project_points(T, model.keypoints[known], frame.intrinsics) - keypoints[known]) ** 2, axis=1))
+        np.mean(np.sum((project_points(T, model.keypoints[known], camera) - keypoints[known]) ** 2, axis=1))
         for T in alike
     ]
     return alike[int(np.nanargmin(distances))]
