@@ -1,0 +1,58 @@
+"""``simtrack train``, ``evaluate detector`` and ``run --detector`` as a user gives them."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.cli.commands import simtrack_command
+from tests.training.data import write_dataset
+
+
+def test_a_detector_is_trained_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch", reason="training needs the extra train")
+    pytest.importorskip("onnx", reason="networks are written with onnx, of the extra train")
+    from simtrack.training import box_task, detector
+
+    monkeypatch.setattr(box_task.BoxTask, "batch_size", 2)
+    monkeypatch.setattr(detector, "SAMPLES", {"keypoints": 2, "boxes": 2})
+    data, out = write_dataset(tmp_path / "data"), tmp_path / "out"
+    done = simtrack_command("train", "detector", "--data", data, "--out", out, "--part", "boxes")
+    assert done.returncode == 0, done.stderr
+    assert "AP50" in done.stdout
+    assert (out / "boxes.onnx").is_file()
+    again = simtrack_command("train", "detector", "--data", data, "--out", out, "--part", "boxes")
+    assert again.returncode == 0
+    assert "AP50" not in again.stdout  # it has learned already
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("train", "detector", "--data", "{tmp}", "--out", "{tmp}/out"), "no dataset.json"),
+        (
+            ("train", "detector", "--data", "{tmp}", "--out", "{tmp}/out", "--minutes", "0"),
+            "minutes = 0.0 is not valid",
+        ),
+        (("evaluate", "detector"), "the folder of a generated data set"),
+        (("evaluate", "detector", "--data", "{tmp}", "--count", "0"), "count = 0 is not valid"),
+        (("run", "--detector", "{tmp}"), "boxes.onnx: no such file"),
+        (("run", "--detector", "{tmp}/mine.onnx"), "mine.onnx: no such file"),
+        (("run", "--detector", "yolo"), "unknown detector 'yolo'"),
+    ],
+)
+def test_what_cannot_be_used_is_told(tmp_path: Path, arguments: tuple[str, ...], told: str) -> None:
+    if arguments[0] == "train":
+        pytest.importorskip("torch", reason="training needs the extra train")
+        pytest.importorskip("onnx", reason="networks are written with onnx, of the extra train")
+    done = simtrack_command(*(argument.format(tmp=tmp_path) for argument in arguments))
+    assert done.returncode == 2
+    assert told in " ".join(done.stderr.split())
+
+
+def test_without_torch_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import importlib.util
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    done = simtrack_command("train", "detector", "--data", tmp_path, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert "simtrack[train]" in done.stderr
