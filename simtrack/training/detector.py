@@ -67,13 +67,17 @@ def train_part(part: Part, config: TrainingConfig, told: "Callable[[Progress], N
     import torch
 
     from simtrack.training.export import export_boxes, export_keypoints
+    from simtrack.training.keypoint_task import KeypointTask
     from simtrack.training.loop import Budget, train
 
     torch.set_num_threads(1)
     task = make_task(part, open_source(config.data), config.out / SHARDS)
     network = train(task, config.out / part, Budget(SAMPLES[part], config.minutes, config.seed), told)
     path = config.out / f"{part}.onnx"
-    (export_keypoints if part == "keypoints" else export_boxes)(network, task.models, path)
+    if isinstance(task, KeypointTask):
+        export_keypoints(network, task.models, task.sigma_scale(network), path)
+    else:
+        export_boxes(network, task.models, path)
     return path
 
 

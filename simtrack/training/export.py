@@ -27,12 +27,20 @@ def export_boxes(network: nn.Module, models: tuple[ObjectModel, ...], path: Path
     _export(network, (image,), ["image"], ["heat", "sides"], {}, about | _classes(models), path)
 
 
-def export_keypoints(network: nn.Module, models: tuple[ObjectModel, ...], path: Path) -> None:
-    """Write a keypoint network: ``window`` (N, 5, S, S), ``told`` (N, classes + 2) to ``coordinates``, ``present``."""
+def export_keypoints(network: nn.Module, models: tuple[ObjectModel, ...], sigma_scale: float, path: Path) -> None:
+    """Write a keypoint network: ``window`` (N, 5, S, S), ``told`` (N, classes + 2) to ``coordinates``, ``present``.
+
+    Args:
+        network: that was trained.
+        models: of the classes.
+        sigma_scale: standard deviation of its errors over the one that it tells.
+        path: of the file.
+    """
     size = KeypointNetwork.size
     inputs = torch.zeros(2, CHANNELS, size, size), torch.zeros(2, len(models) + 2)
     names = ["window", "told", "coordinates", "present"]
     about = {"kind": "keypoints", "size": size, "window": WINDOW, "bins": BINS, "before": BEFORE}
+    about["sigma_scale"] = round(sigma_scale, 3)
     _export(network, inputs, names[:2], names[2:], {name: {0: "n"} for name in names}, about | _classes(models), path)
 
 

@@ -1,12 +1,14 @@
 """How the keypoint network learns: samples, loss, and what is told of it on held-out scenes."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from simtrack.objects import ObjectModel
-from simtrack.perception.detection.bins import BINS, decoded, position_of
+from simtrack.perception.detection.bins import BINS, LEAST_SIGMA, decoded, position_of
 from simtrack.perception.detection.views import WINDOW, window_about
 from simtrack.training.keypoint_samples import Sample, sample
 from simtrack.training.networks import KeypointNetwork
@@ -15,6 +17,24 @@ from simtrack.training.shards import BACKGROUND, Shards
 SOFTNESS = 1.3
 """Standard deviation of the labels' distributions, bins."""
 POINT_WEIGHT, PRESENT_WEIGHT = 2.0, 0.3
+CHI_SQUARE_MEDIAN = 0.4549
+"""Median of the square of a standard normal number."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Errors:
+    """Of held-out windows."""
+
+    errors: list[float]
+    """Of each keypoint, in shares of the object's projected size."""
+    normalised: list[float]
+    """Of each coordinate, over the standard deviation that the network tells."""
+    believed: list[bool]
+    """Of each window: whether the network says that the object is there."""
+
+    def sigma_scale(self) -> float:
+        """From the median, since some windows are taken for another view altogether."""
+        return float(np.sqrt(np.median(np.square(self.normalised)) / CHI_SQUARE_MEDIAN))
 
 
 class KeypointTask:
@@ -61,23 +81,39 @@ class KeypointTask:
 
     def validate(self, network: KeypointNetwork) -> dict[str, float]:
         """Median keypoint error as a share of the object's projected size, and shares of windows rightly believed."""
+        found = self._held_out_errors(network)
+        median, third, ninth = np.percentile(found.errors, [50, 75, 90])
+        return {
+            "median error, % of size": 100 * median,
+            "p75": 100 * third,
+            "p90": 100 * ninth,
+            "believed": float(np.mean(found.believed)),
+            "sigma scale": found.sigma_scale(),
+        }
+
+    def sigma_scale(self, network: nn.Module) -> float:
+        """Standard deviation of the coordinates' errors over the one that the network tells, on held-out windows."""
+        with torch.no_grad():
+            return self._held_out_errors(network).sigma_scale()
+
+    def _held_out_errors(self, network: nn.Module) -> "_Errors":
         rng = np.random.default_rng(0)
-        errors: list[float] = []
-        believed: list[bool] = []
+        found = _Errors([], [], [])
         for first in range(0, len(self._validated), 64):
             records = [self._held_out[int(i)] for i in self._validated[first : first + 64]]
             samples = [sample(record, self.models, rng, plain=True) for record in records]
             shown, told, *_ = self._tensors(samples)
             logits, there = network(shown, told)
-            places, _ = decoded(logits.numpy())
-            believed += (there > 0).tolist()
-            for record, told_of, place in zip(records, samples, places, strict=True):
-                error = np.linalg.norm(place - told_of.keypoints, axis=1) * window_about(record["box"], WINDOW).side
+            places, spreads = decoded(logits.numpy())
+            found.believed.extend((there > 0).tolist())
+            for record, told_of, place, spread in zip(records, samples, places, spreads, strict=True):
+                error = place - told_of.keypoints
+                distance = np.linalg.norm(error, axis=1) * window_about(record["box"], WINDOW).side
                 size = record["intrinsics"][0] * self.models[record["class_index"]].diameter
-                errors += (error / (size / record["T_camera_object"][2, 3])).tolist()
-        spread = np.percentile(errors, [50, 75, 90])
-        return {"median error, % of size": 100 * spread[0], "p75": 100 * spread[1], "p90": 100 * spread[2],
-                "believed": float(np.mean(believed))}  # fmt: skip
+                found.errors.extend((distance / (size / record["T_camera_object"][2, 3])).tolist())
+                sigma = np.maximum(np.sqrt(np.mean(spread**2, axis=1)), LEAST_SIGMA)
+                found.normalised.extend((error / sigma[:, None]).ravel().tolist())
+        return found
 
     @staticmethod
     def _tensors(samples: list[Sample]) -> tuple[Tensor, ...]:

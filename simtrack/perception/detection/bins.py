@@ -10,6 +10,8 @@ BINS = 96
 """For each coordinate."""
 BEFORE = 0.25
 """The bins begin and end this share of a window's side outside of it."""
+LEAST_SIGMA = 0.01
+"""Standard deviations are never taken to be less than this, in shares of the window's side."""
 REACH = 3
 """Bins about the most likely one whose mean is the coordinate."""
 

@@ -24,7 +24,7 @@ from simtrack.contracts import (
 )
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.objects import ObjectModel
-from simtrack.perception.detection.bins import BEFORE, BINS, decoded
+from simtrack.perception.detection.bins import BEFORE, BINS, LEAST_SIGMA, decoded
 from simtrack.perception.detection.boxes import STRIDE, Box, decoded_boxes
 from simtrack.perception.detection.onnx_network import OnnxNetwork, Runtime, open_network
 from simtrack.perception.detection.views import (
@@ -58,10 +58,6 @@ class KeypointDetectorConfig:
     """Windows in which the object is with less probability than this are dropped."""
     max_sigma: float = 0.3
     """Keypoints that are less certain than this, in shares of the window's side, are left out (NaN)."""
-    sigma_scale: float = 1.0
-    """Standard deviations of the keypoints' true errors over those that the network tells."""
-    least_sigma: float = 0.01
-    """... which are never taken to be less than this, in shares of the window's side."""
     runtime: Runtime = "onnxruntime"
     """onnxruntime answers with the same bits everywhere; OpenVINO may be faster."""
 
@@ -102,6 +98,7 @@ class KeypointDetector:
         self._size = _count(self._boxes, about, "width"), _count(self._boxes, about, "height")
         windows = _told(self._keypoints, "keypoints", window=WINDOW, bins=BINS, before=BEFORE)
         self._window = _count(self._keypoints, windows, "size")
+        self._sigma_scale = float(windows.get("sigma_scale", 1.0))
         self._names = _classes(self._keypoints, windows, models)
         if _classes(self._boxes, about, models) != self._names:
             raise FileFormatError(self._boxes.path, "classes", f"differ from those of {self._keypoints.path}")
@@ -165,7 +162,7 @@ class KeypointDetector:
         # Both coordinates' spreads, as the standard deviation of either of them.
         spread = np.sqrt(np.mean(spreads**2, axis=1))
         pixels[spread > self.config.max_sigma] = np.nan
-        sigma = np.maximum(spread * self.config.sigma_scale, self.config.least_sigma) * window.side
+        sigma = np.maximum(spread, LEAST_SIGMA) * (self._sigma_scale * window.side)
         return Detection(self._names[box.class_index], pixels, sigma, box.corners, float(np.sqrt(box.score * there)))
 
 
