@@ -9,7 +9,7 @@ from simtrack.sensors.depth_noise import PRESETS, DepthNoiseConfig
 from simtrack.sensors.faults import CalibrationFaults
 from simtrack.sensors.lidar import LidarNoiseConfig
 from simtrack.simulation.oracles import OracleDetectorConfig
-from simtrack.simulation.scene_file import Push, load_scene
+from simtrack.simulation.scene_file import Carry, Push, load_scene
 from simtrack.simulation.world import configured
 
 
@@ -56,9 +56,11 @@ def test_things_in_the_way_stand_among_the_objects(scene) -> None:
 
 
 def test_the_hand_is_faster_within_what_it_can(scene) -> None:
-    before, after = scene.hand.script, Conditions(speed=2.0).scene(scene).hand.script
-    for old, new in zip(before, after, strict=True):
-        if hasattr(old, "speed"):
+    hand = Conditions(speed=2.0).scene(scene).hand
+    assert hand is not None
+    for old, new in zip(scene.hand.script, hand.script, strict=True):
+        if isinstance(old, Carry | Push):
+            assert isinstance(new, Carry | Push)
             most = 0.5 if isinstance(old, Push) else 1.0
             assert new.speed == pytest.approx(min(2.0 * old.speed, most))
 
