@@ -153,7 +153,7 @@ def _waterfall_figure(w: Waterfall) -> str:
             axes.bar(k, height, bottom=low, color=ACCENT if stage == REST else (GOOD if share >= 0.0 else BAD))
             axes.annotate(f"{height:.3g}", (k, max(low + height, low)), ha="center", va="bottom", color=INK, fontsize=8)
             if stage != REST:
-                axes.plot([k - 1, k + 1], [level - height] * 2, color=MUTED, linewidth=0.6)
+                axes.plot([k - 0.4, k + 1.4], [level - height] * 2, color=MUTED, linewidth=0.6)
                 level -= height
         axes.annotate(f"{scale * w.total:.3g}", (0, scale * w.total), ha="center", va="bottom", color=INK, fontsize=8)
         axes.set_xticks(range(len(names)), names, rotation=0 if width > 5 else 60)

@@ -97,7 +97,7 @@ def _judged(
         model = models.get(thing.class_name)
         predicted = registered = None
         result = results.get(thing.track) if thing.track is not None else None
-        if model is not None and thing.track in moment.predicted:
+        if model is not None and thing.track is not None and thing.track in moment.predicted:
             scorer = PoseScorer(model.mesh.vertices, model.symmetries, model.diameter)
             predicted = scorer.errors(moment.predicted[thing.track], thing.T_camera_object)
             if result is not None:
