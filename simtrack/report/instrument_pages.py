@@ -55,11 +55,10 @@ def write_attribution(case: Case, waterfalls: Sequence[Waterfall], folder: Path)
     }  # fmt: skip
     sections = []
     for w in waterfalls:
-        stages = [*w.after, REST]
-        lost = [*(w.total - w.alone[stage] for stage in w.after), w.shares[REST]]
         rows = [
-            (stage, format_value(share, w.unit), format_value(one, w.unit) if stage != REST else "")
-            for stage, share, one in zip(stages, w.shares.values(), lost, strict=True)
+            (stage, format_value(share, w.unit), format_value(w.total - left, w.unit) if left is not None else "")
+            for stage, share in w.shares.items()
+            for left in [w.alone.get(stage)]
         ]
         text = f"Error of the run: {format_value(w.total, w.unit)}. Most of it is put down to: {w.largest}."
         columns = ("stage", "in the waterfall", "alone")

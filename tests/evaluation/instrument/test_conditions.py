@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from simtrack.contracts import LidarScan
 from simtrack.errors import InvalidValueError, UnknownNameError
 from simtrack.evaluation.instrument.conditions import AXES, Conditions, changed, parse_conditions
+from simtrack.objects import TrackerModelConfig, load_object, tracker_model
 from simtrack.sensors.depth_noise import PRESETS, DepthNoiseConfig
 from simtrack.sensors.faults import CalibrationFaults
-from simtrack.sensors.lidar import LidarNoiseConfig
+from simtrack.sensors.lidar import VLP16, LidarNoiseConfig
 from simtrack.simulation.oracles import OracleDetectorConfig
 from simtrack.simulation.scene_file import Carry, Push, load_scene
 from simtrack.simulation.world import configured
@@ -47,6 +49,22 @@ def test_the_believed_camera_is_turned_by_so_many_degrees(scene) -> None:
     T = faults.believed_camera(np.eye(4))
     assert np.degrees(np.arccos(0.5 * (np.trace(T[:3, :3]) - 1.0))) == pytest.approx(2.0)
     assert faults.camera_time_offset == 0.05
+
+
+def test_lasers_are_taken_for_each_other_and_shapes_for_symmetric_ones(scene) -> None:
+    changed_scene = Conditions(lidar_mirrored=1, false_symmetry=1).scene(scene)
+    faults = configured(CalibrationFaults, changed_scene.sensors.calibration, scene, "")
+    shots = VLP16.shots()
+    ranges = np.ones(len(shots), np.float32)
+    scan = LidarScan(0, shots.directions, ranges, shots.times, shots.rings, ranges, np.eye(4))
+    told = faults.apply(scan)
+    assert isinstance(told, LidarScan)
+    assert told.directions[:, 2] == pytest.approx(-scan.directions[:, 2]) and told.rings.dtype == np.uint8
+    assert (told.rings + scan.rings == 15).all()
+    config = configured(TrackerModelConfig, changed_scene.tracker_models, scene, "")
+    drill = load_object("powerdrill")
+    told_model = tracker_model(drill, config, np.random.default_rng(0))
+    assert len(told_model.symmetries.discrete) == 2 * len(drill.symmetries.discrete)
 
 
 def test_things_in_the_way_stand_among_the_objects(scene) -> None:
