@@ -16,6 +16,7 @@ def attribute(
     localizer: str | None = None,
     detector: str = "oracle",
     renderer: Literal["mujoco", "embree"] = "mujoco",
+    alone: bool = True,
     out: Path | None = None,
     work: Path = Path("runs/cases"),
     workers: int = 1,
@@ -36,6 +37,7 @@ def attribute(
         localizer: A localizer of yours, package.module:Class.
         detector: What detects objects in images: oracle, or package.module:Class.
         renderer: mujoco needs OpenGL (EGL), embree needs none.
+        alone: Also make each stage perfect alone; without, half as many runs.
         out: Folder for attribution.json and attribution.html; runs/SCENE-SEED-attribution if not given.
         work: Folder where runs are kept.
         workers: Runs at a time.
@@ -57,7 +59,7 @@ def attribute(
     with console.ProgressLine(f"attribute {scene}", "looking for runs that are done") as line:
         runner = Runner(work, workers, report=lambda done, of, what: line.show(f"{done}/{of} · {what}", done / of))
         try:
-            waterfalls = explain(base, runner, tuple(name for name in stages.split(",") if name))
+            waterfalls = explain(base, runner, tuple(name for name in stages.split(",") if name), each=alone)
         except KeyboardInterrupt:
             console.show_error("stopped: runs that are done are kept, and the same command carries on")
             return 130

@@ -10,6 +10,7 @@ from simtrack.cli.attribute import attribute
 from simtrack.cli.bench import bench
 from simtrack.cli.check import check
 from simtrack.cli.compare import compare
+from simtrack.cli.debug import debug
 from simtrack.cli.env import env
 from simtrack.cli.evaluate import evaluate
 from simtrack.cli.generate import generate
@@ -33,6 +34,7 @@ VERBS = {
     "attribute": attribute,
     "sweep": sweep,
     "compare": compare,
+    "debug": debug,
     "env": env,
     "generate": generate,
     "inspect": inspect,

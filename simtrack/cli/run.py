@@ -19,6 +19,7 @@ def run(
     tracker: str | None = None,
     localizer: str | None = None,
     detector: str = "oracle",
+    scene_graph: str | None = None,
     stage_limit: float = 5.0,
     renderer: Literal["mujoco", "embree"] = "mujoco",
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
@@ -41,6 +42,7 @@ def run(
         detector: What detects objects in images: oracle (knows the truth, and errs like a trained network), keypoints
             (the networks that come along), a folder that `simtrack train detector` wrote, a YOLOv8-pose .onnx file, or
             package.module:Class.
+        scene_graph: What says how things stand to each other, of yours, package.module:Class.
         stage_limit: Seconds that a stage of yours has for a frame; after that the frame counts as missed.
         renderer: mujoco needs OpenGL (EGL), embree needs none.
         overwrite: Replace the results in an existing folder.
@@ -65,7 +67,7 @@ def run(
     config = RunConfig(
         scene=loaded, out=folder, duration=duration, seed=seed, agent=agent, detector=detector, renderer=renderer,
         overwrite=overwrite, log=log, compare_gaze=compare_gaze, threads=threads,
-        tracker=tracker, localizer=localizer, stage_limit=stage_limit,
+        tracker=tracker, localizer=localizer, scene_graph=scene_graph, stage_limit=stage_limit,
     )  # fmt: skip
     observers = _observers(view, rrd)
     with console.ProgressLine(f"{loaded.name} · seed {seed}") as line, cold_start_told(line.say):

@@ -32,6 +32,7 @@ from simtrack.contracts import (
 from simtrack.errors import InvalidValueError
 from simtrack.evaluation.evaluator import Evaluator, pose_scorers, true_models
 from simtrack.evaluation.foreign_stages import fault_metrics, foreign_stages, write_faults
+from simtrack.evaluation.instrument.moments import MomentKeeper
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
 from simtrack.evaluation.record import RelationTimeline, RunRecord, graph_name
 from simtrack.evaluation.run_config import FIXED_GAZE, ORACLE, RunConfig
@@ -43,6 +44,7 @@ from simtrack.objects import ObjectModel
 from simtrack.perception.detection.loading import make_image_detector
 from simtrack.perception.foreign import StageContext, Watch
 from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.tracking.tracker import ObjectTracker
 from simtrack.simulation.agents import AgentContext, make_agent
 from simtrack.simulation.oracles import OracleDetector, OracleLocalizer
 from simtrack.simulation.randomness import stream
@@ -210,6 +212,7 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
             config=config.stack,
             localizer=OracleLocalizer(simulation.truth) if config.localizer == ORACLE else foreign.localizer,
             tracker=foreign.tracker,
+            scene_graph=foreign.scene_graph,
         )
         exits.callback(stack.close)
         yield Loop(simulation, stack, make_agent(agent, context), start, foreign.watches, config.script)
@@ -235,6 +238,7 @@ class ClosedLoopRun:
     _clock: Clock = field(default_factory=Clock)
     _stages: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     _timeline: RelationTimeline = field(default_factory=RelationTimeline)
+    _moments: MomentKeeper = field(default_factory=MomentKeeper)
     _images: int = 0
     _steady_from: tuple[int, float, float] | None = None
     """Images, seconds of the loop and of the evaluation at the end of the warm-up."""
@@ -273,13 +277,17 @@ class ClosedLoopRun:
                     objects = evaluator.observe(frame, belief)
                     if belief is not None and evaluator.advanced:
                         estimates.add(belief)
-                        truths.add(len(evaluator.trajectory.stamps) - 1, belief, evaluator.trajectory.true[-1], objects)
+                        image, tracker = len(evaluator.trajectory.stamps) - 1, loop.stack.tracker
+                        truths.add(image, belief, evaluator.trajectory.true[-1], objects)
+                        if isinstance(tracker, ObjectTracker):
+                            self._moments.see(image, tracker.trace, objects)
                         self._remember(belief)
             if config.compare_gaze and not stop.asked:
                 self._compare(evaluator, stop)
             self._partial, self.commands = stop.asked, tuple(loop.given)
             record = self._record(loop, evaluator)
             folder.write_metrics(record.metrics)
+            self._moments.save(folder.path)
             if loop.watches:
                 write_faults(folder.path / "faults.csv", [fault for watch in loop.watches for fault in watch.faults])
             folder.write_graph(loop.stack.graph.to_json())
@@ -304,6 +312,7 @@ class ClosedLoopRun:
                 saved = loop.simulation.now
                 folder.write_metrics(self._metrics(evaluator, loop.watches))
                 folder.write_graph(loop.stack.graph.to_json())
+                self._moments.save(folder.path)
             if stop.asked:
                 return
 

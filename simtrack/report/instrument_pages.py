@@ -55,11 +55,10 @@ def write_attribution(case: Case, waterfalls: Sequence[Waterfall], folder: Path)
     }  # fmt: skip
     sections = []
     for w in waterfalls:
-        stages = [*w.after, REST]
-        lost = [*(w.total - w.alone[stage] for stage in w.after), w.shares[REST]]
         rows = [
-            (stage, format_value(share, w.unit), format_value(one, w.unit) if stage != REST else "")
-            for stage, share, one in zip(stages, w.shares.values(), lost, strict=True)
+            (stage, format_value(share, w.unit), format_value(w.total - left, w.unit) if left is not None else "")
+            for stage, share in w.shares.items()
+            for left in [w.alone.get(stage)]
         ]
         text = f"Error of the run: {format_value(w.total, w.unit)}. Most of it is put down to: {w.largest}."
         columns = ("stage", "in the waterfall", "alone")
@@ -153,7 +152,7 @@ def _waterfall_figure(w: Waterfall) -> str:
             axes.bar(k, height, bottom=low, color=ACCENT if stage == REST else (GOOD if share >= 0.0 else BAD))
             axes.annotate(f"{height:.3g}", (k, max(low + height, low)), ha="center", va="bottom", color=INK, fontsize=8)
             if stage != REST:
-                axes.plot([k - 1, k + 1], [level - height] * 2, color=MUTED, linewidth=0.6)
+                axes.plot([k - 0.4, k + 1.4], [level - height] * 2, color=MUTED, linewidth=0.6)
                 level -= height
         axes.annotate(f"{scale * w.total:.3g}", (0, scale * w.total), ha="center", va="bottom", color=INK, fontsize=8)
         axes.set_xticks(range(len(names)), names, rotation=0 if width > 5 else 60)

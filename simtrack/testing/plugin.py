@@ -33,7 +33,7 @@ def simtrack_runs(request: pytest.FixtureRequest) -> SimtrackRuns:
     from simtrack.evaluation.instrument.conditions import AXES, Conditions
 
     work = Path(str(request.config.getoption("--simtrack-work")))
-    runner = Runner(work, int(request.config.getoption("--simtrack-workers")))
+    runner = Runner(work, int(str(request.config.getoption("--simtrack-workers"))))
 
     def make(scene: str = "workbench", **settings: Any) -> Runs:
         conditions = {name: settings.pop(name) for name in list(settings) if name in AXES}

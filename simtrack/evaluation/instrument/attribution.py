@@ -32,8 +32,8 @@ MEASURES: Mapping[str, tuple[str, bool]] = {
 
 
 def _calibration(case: Case) -> Case:
-    changes = {"calibration": 0.0, "extrinsics": 0.0, "time_offset": 0.0}
-    return replace(case, conditions=replace(case.conditions, **changes))
+    conditions = replace(case.conditions, calibration=0.0, extrinsics=0.0, time_offset=0.0, lidar_mirrored=0)
+    return replace(case, conditions=conditions)
 
 
 def _noise(case: Case) -> Case:
@@ -41,7 +41,7 @@ def _noise(case: Case) -> Case:
 
 
 def _models(case: Case) -> Case:
-    return replace(case, conditions=replace(case.conditions, model_error=0.0, model_scale=0.0))
+    return replace(case, conditions=replace(case.conditions, model_error=0.0, model_scale=0.0, false_symmetry=0))
 
 
 def _latency(case: Case) -> Case:
@@ -80,7 +80,7 @@ class Waterfall:
     after: Mapping[str, float]
     """Stage -> error once it and all before it are perfect, in the waterfall's order."""
     alone: Mapping[str, float]
-    """Stage -> error once it alone is perfect."""
+    """Stage -> error once it alone is perfect; empty if that was not asked."""
 
     @property
     def shares(self) -> dict[str, float]:
@@ -98,8 +98,10 @@ class Waterfall:
         return max(shares, key=lambda stage: shares[stage])
 
 
-def variants(base: Case, stages: Sequence[str] = tuple(STAGES)) -> tuple[dict[str, Case], dict[str, Case]]:
-    """Cases with all stages up to each perfect, and with each alone perfect; they follow the base's way.
+def variants(
+    base: Case, stages: Sequence[str] = tuple(STAGES), each: bool = True
+) -> tuple[dict[str, Case], dict[str, Case]]:
+    """Cases with all stages up to each perfect, and (`each`) with each alone perfect; they follow the base's way.
 
     Raises:
         UnknownNameError: there is no such stage.
@@ -112,11 +114,15 @@ def variants(base: Case, stages: Sequence[str] = tuple(STAGES)) -> tuple[dict[st
     for stage in stages:
         case = STAGES[stage](case)
         after[stage] = case
-    return after, {stage: STAGES[stage](start) for stage in stages}
+    return after, {stage: STAGES[stage](start) for stage in stages} if each else {}
 
 
 def attribute(
-    base: Case, runner: Runner, stages: Sequence[str] = tuple(STAGES), measures: Sequence[str] = tuple(MEASURES)
+    base: Case,
+    runner: Runner,
+    stages: Sequence[str] = tuple(STAGES),
+    measures: Sequence[str] = tuple(MEASURES),
+    each: bool = True,
 ) -> list[Waterfall]:
     """Waterfalls of the measures that all runs could take.
 
@@ -125,6 +131,7 @@ def attribute(
         runner: runs the variants.
         stages: which stages become perfect, in this order.
         measures: of `MEASURES`.
+        each: also make each stage perfect alone, which takes as many runs again.
 
     Raises:
         UnknownNameError: an unknown stage or measure.
@@ -133,7 +140,7 @@ def attribute(
     for measure in measures:
         if measure not in MEASURES:
             raise UnknownNameError("measure", measure, MEASURES)
-    after, alone = variants(base, stages)
+    after, alone = variants(base, stages, each)
     first = runner.run([base])[base]
     outcomes = {base: first}
     if not isinstance(first, SimtrackError):

@@ -46,12 +46,16 @@ class Conditions:
     """Factor on the errors of the tracker's models; 0: the true shapes."""
     model_scale: float = 0.0
     """Share by which the tracker's models are too large, at random up to this; 0: as the scene says."""
+    false_symmetry: int = 0
+    """1: the tracker's models are said to look the same after half a turn about z."""
     calibration: float = 1.0
     """Factor on the scene's own calibration faults; 0: none."""
     extrinsics: float = 0.0
     """Degrees by which the believed camera is turned about the base's y axis (nodding)."""
     time_offset: float = 0.0
     """Seconds added to the stamps of camera frames."""
+    lidar_mirrored: int = 0
+    """1: the lidar's lasers are taken for each other, the highest for the lowest."""
     detection: float = 1.0
     """Factor on the detector's errors; 0: a perfect detector, if late."""
     detector_bias: float = 0.0
@@ -75,6 +79,9 @@ class Conditions:
                 raise InvalidValueError(name, getattr(self, name), f"-{most:g} to {most:g}")
         if self.latency is not None and not 0.0 <= self.latency <= 5.0:
             raise InvalidValueError("latency", self.latency, "0 to 5 s")
+        for name in ("lidar_mirrored", "false_symmetry"):
+            if getattr(self, name) not in (0, 1):
+                raise InvalidValueError(name, getattr(self, name), "0 or 1")
         if not 0 <= self.occlusion <= MOST_OCCLUDERS or self.occlusion != int(self.occlusion):
             raise InvalidValueError("occlusion", self.occlusion, f"a whole number from 0 to {MOST_OCCLUDERS}")
 
@@ -134,7 +141,7 @@ class Conditions:
         return out
 
     def _with_models(self, scene: SceneFile) -> SceneFile:
-        if self.model_error == 1.0 and self.model_scale == 0.0:
+        if self.model_error == 1.0 and self.model_scale == 0.0 and not self.false_symmetry:
             return scene
         given, standard, factor = dict(scene.tracker_models), TrackerModelConfig(), self.model_error
         for name, most in (("noise", 0.05), ("max_scale_error", 0.5)):
@@ -142,10 +149,11 @@ class Conditions:
         if factor == 0.0:
             given["face_share"] = 1.0
         given["max_scale_error"] = max(given["max_scale_error"], self.model_scale)
+        given["false_symmetry"] = bool(self.false_symmetry)
         return scene.model_copy(update={"tracker_models": given})
 
     def _with_calibration(self, scene: SceneFile) -> SceneFile:
-        if self.calibration == 1.0 and self.extrinsics == 0.0 and self.time_offset == 0.0:
+        if (self.calibration, self.extrinsics, self.time_offset, self.lidar_mirrored) == (1.0, 0.0, 0.0, 0):
             return scene
         given, standard = dict(scene.sensors.calibration), CalibrationFaults()
         for name in ("camera", "lidar"):
@@ -155,6 +163,7 @@ class Conditions:
         given["encoder_bias"] = {k: self.calibration * float(v) for k, v in given.get("encoder_bias", {}).items()}
         given["camera"][4] += float(np.deg2rad(self.extrinsics))
         given["camera_time_offset"] += self.time_offset
+        given["lidar_mirrored"] = bool(self.lidar_mirrored)
         return scene.model_copy(update={"sensors": scene.sensors.model_copy(update={"calibration": given})})
 
     def _with_speed(self, scene: SceneFile) -> SceneFile:
@@ -184,8 +193,9 @@ class Conditions:
         return scene.model_copy(update={"clutter": (*scene.clutter, *added)})
 
 
+_WHOLE = ("occlusion", "lidar_mirrored", "false_symmetry")
 AXES: Mapping[str, Callable[[float], object]] = {
-    field.name: int if field.name == "occlusion" else float for field in fields(Conditions)
+    field.name: int if field.name in _WHOLE else float for field in fields(Conditions)
 }
 """What can be swept, and the type of its values."""
 

@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
+from simtrack.contracts import LidarScan
 from simtrack.errors import InvalidValueError, UnknownNameError
 from simtrack.evaluation.instrument.conditions import AXES, Conditions, changed, parse_conditions
+from simtrack.objects import TrackerModelConfig, load_object, tracker_model
 from simtrack.sensors.depth_noise import PRESETS, DepthNoiseConfig
 from simtrack.sensors.faults import CalibrationFaults
-from simtrack.sensors.lidar import LidarNoiseConfig
+from simtrack.sensors.lidar import VLP16, LidarNoiseConfig
 from simtrack.simulation.oracles import OracleDetectorConfig
-from simtrack.simulation.scene_file import Push, load_scene
+from simtrack.simulation.scene_file import Carry, Push, load_scene
 from simtrack.simulation.world import configured
 
 
@@ -49,6 +51,22 @@ def test_the_believed_camera_is_turned_by_so_many_degrees(scene) -> None:
     assert faults.camera_time_offset == 0.05
 
 
+def test_lasers_are_taken_for_each_other_and_shapes_for_symmetric_ones(scene) -> None:
+    changed_scene = Conditions(lidar_mirrored=1, false_symmetry=1).scene(scene)
+    faults = configured(CalibrationFaults, changed_scene.sensors.calibration, scene, "")
+    shots = VLP16.shots()
+    ranges = np.ones(len(shots), np.float32)
+    scan = LidarScan(0, shots.directions, ranges, shots.times, shots.rings, ranges, np.eye(4))
+    told = faults.apply(scan)
+    assert isinstance(told, LidarScan)
+    assert told.directions[:, 2] == pytest.approx(-scan.directions[:, 2]) and told.rings.dtype == np.uint8
+    assert (told.rings + scan.rings == 15).all()
+    config = configured(TrackerModelConfig, changed_scene.tracker_models, scene, "")
+    drill = load_object("powerdrill")
+    told_model = tracker_model(drill, config, np.random.default_rng(0))
+    assert len(told_model.symmetries.discrete) == 2 * len(drill.symmetries.discrete)
+
+
 def test_things_in_the_way_stand_among_the_objects(scene) -> None:
     added = Conditions(occlusion=3).scene(scene).clutter[len(scene.clutter) :]
     assert [thing.id for thing in added] == ["occluder-1", "occluder-2", "occluder-3"]
@@ -56,9 +74,11 @@ def test_things_in_the_way_stand_among_the_objects(scene) -> None:
 
 
 def test_the_hand_is_faster_within_what_it_can(scene) -> None:
-    before, after = scene.hand.script, Conditions(speed=2.0).scene(scene).hand.script
-    for old, new in zip(before, after, strict=True):
-        if hasattr(old, "speed"):
+    hand = Conditions(speed=2.0).scene(scene).hand
+    assert hand is not None
+    for old, new in zip(scene.hand.script, hand.script, strict=True):
+        if isinstance(old, Carry | Push):
+            assert isinstance(new, Carry | Push)
             most = 0.5 if isinstance(old, Push) else 1.0
             assert new.speed == pytest.approx(min(2.0 * old.speed, most))
 
