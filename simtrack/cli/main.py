@@ -23,8 +23,8 @@ from simtrack.cli.run import run
 from simtrack.cli.scenes import scenes
 from simtrack.cli.score import score
 from simtrack.cli.sweep import sweep
-from simtrack.cli.trials import trials
 from simtrack.cli.train import train
+from simtrack.cli.trials import trials
 from simtrack.cli.validate import validate
 
 VERBS = {
