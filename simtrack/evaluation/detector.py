@@ -24,6 +24,8 @@ VISIBLE = 0.5
 """Objects of which less is seen are not counted."""
 SAME = 0.5
 """Overlap of boxes from which a detection is that of an object."""
+LEAST_SCORE = 0.05
+"""Boxes count from here on for average precision, which looks at all scores; keypoints as the detector is set."""
 STEPS = {"pnp": (0.02, 15.0), "depth": (0.02, 15.0), "registered": (0.005, 3.0)}
 """Poses after PnP, after depth alignment, after registration: metres and degrees within which a pose is good."""
 
@@ -117,8 +119,9 @@ def _some(source: Source, count: int | None) -> Iterator[tuple[int, int, Labelle
 def _score(scores: DetectorScores, steps: "_PoseSteps", detector: KeypointDetector, image: LabelledImage) -> None:
     frame = RgbdFrame(0, image.depth, image.rgb, image.intrinsics, np.eye(4))
     began = process_time()
-    boxes = detector.boxes(image.rgb, image.depth)
-    detections = detector.keypoints(boxes, image.rgb, image.depth, image.intrinsics.fx)
+    boxes = detector.boxes(image.rgb, image.depth, LEAST_SCORE)
+    taken = [box for box in boxes if box.score >= detector.config.box_score]
+    detections = detector.keypoints(taken, image.rgb, image.depth, image.intrinsics.fx)
     scores.seconds.append(process_time() - began)
     scores.found.append(boxes)
     labels = image.labels

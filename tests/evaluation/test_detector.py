@@ -13,6 +13,7 @@ from simtrack.evaluation import detector as evaluation
 from simtrack.evaluation.detector import evaluate_detector, nearest_alike, write_scores
 from simtrack.objects import load_object
 from simtrack.perception.detection.boxes import Box
+from simtrack.perception.detection.keypoint_detector import KeypointDetectorConfig
 from simtrack.perception.detection.pnp import project_points
 from simtrack.training.source import Label, LabelledImage, Source
 from tests.perception.tracking.scenes import INTRINSICS, BenchWorld, in_camera, on_bench
@@ -26,7 +27,9 @@ class Known:
     def __init__(self, boxes: list[Box], detections: list[Detection]) -> None:
         self._boxes, self._detections = boxes, detections
 
-    def boxes(self, rgb: np.ndarray, depth: np.ndarray) -> list[Box]:
+        self.config = KeypointDetectorConfig()
+
+    def boxes(self, rgb: np.ndarray, depth: np.ndarray, least_score: float) -> list[Box]:
         return self._boxes
 
     def keypoints(self, boxes: Sequence[Box], *image: Any) -> tuple[Detection, ...]:

@@ -52,9 +52,9 @@ class KeypointDetectorConfig:
 
     latency: float = 0.2
     """Seconds of simulated or recorded time from the image's stamp to the answer. The next image is taken then."""
-    box_score: float = 0.25
+    box_score: float = 0.4
     """Boxes with a lower score are not looked at."""
-    present: float = 0.4
+    present: float = 0.9
     """Windows in which the object is with less probability than this are dropped."""
     max_sigma: float = 0.3
     """Keypoints that are less certain than this, in shares of the window's side, are left out (NaN)."""
@@ -119,14 +119,19 @@ class KeypointDetector:
             frame.stamp, available, self.keypoints(found, frame.rgb, frame.depth, frame.intrinsics.fx)
         )
 
-    def boxes(self, rgb: Uint8, depth: Float32) -> list[Box]:
-        """Boxes of the wanted objects in an image, in its own pixels, best first."""
+    def boxes(self, rgb: Uint8, depth: Float32, least_score: float | None = None) -> list[Box]:
+        """Boxes of the wanted objects in an image, in its own pixels, best first; from the configured score on if None.
+
+        Args:
+            rgb: (H, W, 3).
+            depth: (H, W), metres, 0 = no reading.
+            least_score: 0 to 1.
+        """
+        least_score = self.config.box_score if least_score is None else least_score
         small = shown_image(*reduced(rgb, depth, *self._size))
         heat, sides = self._boxes.run({"image": small[None]})
         scale = np.tile(np.array(depth.shape[::-1]) / np.array(self._size), 2)
-        wanted = (
-            box for box in decoded_boxes(heat[0], sides[0], self.config.box_score) if self._diameters[box.class_index]
-        )
+        wanted = (box for box in decoded_boxes(heat[0], sides[0], least_score) if self._diameters[box.class_index])
         return [Box(box.class_index, (box.corners + 0.5) * scale - 0.5, box.score) for box in wanted]
 
     def keypoints(self, boxes: Sequence[Box], rgb: Uint8, depth: Float32, focal: float) -> tuple[Detection, ...]:
