@@ -165,3 +165,16 @@ def test_files_that_are_no_networks_are_refused(tmp_path: Path) -> None:
 def test_settings_are_checked() -> None:
     with pytest.raises(InvalidValueError, match="latency"):
         KeypointDetectorConfig(latency=-1.0)
+
+
+def test_the_networks_that_come_along_know_the_workbench() -> None:
+    from simtrack.objects import load_object
+
+    names = ("klt3147", "materialbox", "multimeter", "powerdrill", "relay", "screwdriver")
+    detector = KeypointDetector({name: load_object(name) for name in names})
+    assert detector.class_names == names
+    blank = np.full((480, 640, 3), 90, np.uint8)
+    once, again = (detector.detect(frame(blank)) for _ in range(2))
+    assert once.detections == again.detections == ()
+    assert sum(path.stat().st_size for path in keypoint_detector.SHIPPED.glob("*.onnx")) < 12_000_000
+    check_image_detector("keypoints")
