@@ -108,7 +108,7 @@ def _compose(a: Float64, b: Float64) -> Float64:
 
 def _inverse(a: Float64) -> Float64:
     inverse = np.linalg.inv(a[:, :2])
-    return np.column_stack([inverse, -inverse @ a[:, 2]])
+    return np.asarray(np.column_stack([inverse, -inverse @ a[:, 2]]), np.float64)
 
 
 def _projected(points: Float64, T: Float64, intrinsics: Float64) -> Float64:

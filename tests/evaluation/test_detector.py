@@ -50,11 +50,14 @@ def image() -> LabelledImage:
     return LabelledImage(0, np.zeros((*depth.shape, 3), np.uint8), depth, INTRINSICS, tuple(labels))
 
 
-def scored(image: LabelledImage, monkeypatch: pytest.MonkeyPatch, boxes: list[Box], detections: list[Detection]):
+def scored(
+    image: LabelledImage, monkeypatch: pytest.MonkeyPatch, boxes: list[Box], detections: list[Detection]
+) -> dict[str, float]:
     monkeypatch.setattr(evaluation, "_some", lambda source, count: iter([(1, 1, image)]))
     source = Source(Path(), tuple(load_object(name) for name in NAMES), {1: 0, 2: 1}, ())
     known: Any = Known(boxes, detections)
-    return {name: metric.value for name, metric in evaluate_detector(source, known).metrics().items()}
+    metrics = evaluate_detector(source, known).metrics()
+    return {name: float(metric.value) for name, metric in metrics.items() if metric.value is not None}
 
 
 def detections(image: LabelledImage, offset: float = 0.0, sigma: float = 2.0) -> list[Detection]:
