@@ -4,11 +4,14 @@ Snapping moves models along z and on the level, so that Eq. 1 holds for what sta
 lies on a pile and what stands on an uneven model touches at points that no single plane explains: such bodies settle
 in a strongly damped simulation of the exported shapes in MuJoCo. Whoever is at rest already stays exactly where
 snapping put it. The motion is bounded: a body that would topple or go far is held where it was seen, and reported.
-Joints of articulated models keep their position. The judge of a scene is another engine, see `simtrack.plausibility`.
+
+Rest must not hang on a millimetre or on one engine's way of counting contacts: the scene at rest is tilted a little to
+each side, and what moves then is reported as wobbly. Joints of articulated models keep their position. The judge of a
+scene is another engine, see `simtrack.plausibility`.
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +30,11 @@ STIFF = (2.0 * TIMESTEP, 1.0)
 PHASES = ((400, 0.8), (800, 0.98))
 """Steps, and the share of its velocity that a body keeps in a step: first it cannot jump out of what it is in, then it
 falls over if it stands on an edge."""
+TILTING = (300, 0.995)
+"""The same while the scene is tilted to one side: half a second, in which what stands on an edge falls visibly."""
+SIDES = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+"""Directions in which the scene is tilted; first it is not."""
+GRAVITY = 9.81
 STILL = 2e-4
 """m/s and rad/s below which nothing moves any more."""
 LEAST = 50
@@ -49,15 +57,21 @@ class SettlingConfig:
     """Share of the friction that is counted on."""
     rounds: int = 4
     """Of holding what went too far and settling the others again; 0: nothing settles."""
+    tilt: float = float(np.radians(2.0))
+    """Radians by which the scene at rest is tilted to each side; 0: it is not."""
+    wobble: float = 0.01
+    """Metres of motion of any of its points from which a body that is tilted so is wobbly."""
 
     def __post_init__(self) -> None:
-        for name in ("shift", "turn", "rest", "depth"):
+        for name in ("shift", "turn", "rest", "depth", "wobble"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise InvalidValueError(f"SettlingConfig.{name}", getattr(self, name), "positive and finite")
         if not 0.0 < self.friction <= 1.0:
             raise InvalidValueError("SettlingConfig.friction", self.friction, "a share in (0, 1]")
         if self.rounds < 0:
             raise InvalidValueError("SettlingConfig.rounds", self.rounds, "0 or more")
+        if not 0.0 <= self.tilt < 0.5:
+            raise InvalidValueError("SettlingConfig.tilt", self.tilt, "radians from 0 to 0.5")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,63 +94,114 @@ class Settled:
     """Bodies that would have gone too far, and how far."""
     stuck: Mapping[str, float]
     """Free components that are deeper than `SettlingConfig.depth` in another at rest, and how deep, metres."""
+    wobbly: Mapping[str, float] = field(default_factory=dict)
+    """Free components that rest, but move by more than `SettlingConfig.wobble` when tilted, and how far, metres."""
+
+    @property
+    def restless(self) -> dict[str, float]:
+        """Free components whose place is none to rest, and how bad it is, metres."""
+        far = {name: motion.shift for name, motion in self.held.items()}
+        return {**self.wobbly, **self.stuck, **far}
+
+    def trouble(self, body: str) -> str:
+        """What keeps a restless component from resting."""
+        if body in self.held:
+            motion = self.held[body]
+            return f"would go {1e3 * motion.shift:.0f} mm and turn by {np.degrees(motion.turn):.0f} degrees"
+        if body in self.stuck:
+            return f"is {1e3 * self.stuck[body]:.1f} mm deep in another at rest"
+        return f"moves by {1e3 * self.wobbly[body]:.0f} mm when the scene is tilted a little"
 
 
 def settle(tree: BodyTree, config: SettlingConfig | None = None) -> Settled:
     """Let the free components of a tree come to rest; the others, and all joints, stay."""
     config = config or SettlingConfig()
-    start = {part.name: np.asarray(part.T_scene_root, float) for part in tree.components if not part.static}
+    parts = {part.name: part for part in tree.components if not part.static}
+    start = {name: np.asarray(part.T_scene_root, float) for name, part in parts.items()}
     held: dict[str, Motion] = {}
     depths: dict[str, float] = {}
+    wobbly: dict[str, float] = {}
     poses = dict(start)
     for _ in range(config.rounds):
         if len(held) == len(start):
             break
-        found, depths = _simulated(tree, held, config)
+        simulation = _Simulation(tree, held, config)
+        simulation.rest()
+        found, depths = simulation.poses(), simulation.depths()
         motions = {name: _motion(tree.by_name[name], start[name], T) for name, T in found.items()}
         far = {n: m for n, m in motions.items() if not (m.shift <= config.shift and m.turn <= config.turn)}
         poses = {**start, **{name: T for name, T in found.items() if name not in far}}
         held |= far
         if not far:
+            wobbly = simulation.wobbling(parts)
             break
-    parts = {part.name: part for part in tree.components}
     kept = {name: T if _moved(parts[name], start[name], T) > config.rest else start[name] for name, T in poses.items()}
-    return Settled(kept, held, {name: depths[name] for name in start if depths.get(name, 0.0) > config.depth})
+    stuck = {name: depths[name] for name in start if depths.get(name, 0.0) > config.depth}
+    return Settled(kept, held, stuck, wobbly)
 
 
-def _simulated(
-    tree: BodyTree, held: Collection[str], config: SettlingConfig
-) -> tuple[dict[str, Float64], dict[str, float]]:
-    """Free components that are not held -> (4, 4) T_scene_root at rest; all -> metres that they are in others."""
-    import mujoco
+class _Simulation:
+    """A tree in MuJoCo, every component rigid; those that are held are fixed."""
 
-    spec = mujoco.MjSpec()
-    spec.option.timestep = TIMESTEP
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0
-    local = tree.forward()
-    free = [part for part in tree.components if not part.static and part.name not in held]
-    loose = {part.name for part in free}
-    for part in tree.components:
-        _add_component(spec, part, local, config, loose=part.name in loose)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    for steps, kept in PHASES:
+    def __init__(self, tree: BodyTree, held: Collection[str], config: SettlingConfig) -> None:
+        import mujoco
+
+        spec = mujoco.MjSpec()
+        spec.option.timestep = TIMESTEP
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        spec.option.impratio = 10.0
+        local = tree.forward()
+        self._free = [part.name for part in tree.components if not part.static and part.name not in held]
+        for part in tree.components:
+            _add_component(spec, part, local, config, loose=part.name in self._free)
+        self._config = config
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+
+    def rest(self) -> None:
+        """Simulate until nothing moves, or long enough."""
+        for steps, kept in PHASES:
+            self._step(steps, kept)
+
+    def _step(self, steps: int, kept: float) -> None:
+        import mujoco
+
         for step in range(steps):
-            mujoco.mj_step(model, data)
-            data.qvel *= kept
-            if step >= LEAST and np.abs(data.qvel).max(initial=0.0) < STILL:
+            mujoco.mj_step(self._model, self._data)
+            self._data.qvel *= kept
+            if step >= LEAST and np.abs(self._data.qvel).max(initial=0.0) < STILL:
                 break
-    mujoco.mj_fwdPosition(model, data)
-    depths: dict[str, float] = {}
-    for contact in data.contact:
-        for geom in contact.geom:
-            name = model.body(int(model.body_rootid[model.geom_bodyid[geom]])).name
-            depths[name] = max(depths.get(name, 0.0), -float(contact.dist))
-    states = {part.name: data.body(part.name) for part in free}
-    poses = {name: transform(state.xmat.reshape(3, 3).copy(), state.xpos.copy()) for name, state in states.items()}
-    return poses, depths
+        mujoco.mj_fwdPosition(self._model, self._data)
+
+    def poses(self) -> dict[str, Float64]:
+        """Free components -> (4, 4) T_scene_root."""
+        states = {name: self._data.body(name) for name in self._free}
+        return {name: transform(state.xmat.reshape(3, 3).copy(), state.xpos.copy()) for name, state in states.items()}
+
+    def depths(self) -> dict[str, float]:
+        """All components -> metres that they are in others; those that touch nothing are missing."""
+        found: dict[str, float] = {}
+        for contact in self._data.contact:
+            for geom in contact.geom:
+                name = self._model.body(int(self._model.body_rootid[self._model.geom_bodyid[geom]])).name
+                found[name] = max(found.get(name, 0.0), -float(contact.dist))
+        return found
+
+    def wobbling(self, parts: Mapping[str, Component]) -> dict[str, float]:
+        """Free components that move too far when the scene is tilted, and how far, metres. It is put back at rest."""
+        if self._config.tilt == 0.0:
+            return {}
+        resting, state = self.poses(), self._data.qpos.copy()
+        gone = dict.fromkeys(self._free, 0.0)
+        for side in SIDES:
+            across = np.sin(self._config.tilt) * np.array(side)
+            self._model.opt.gravity[:] = GRAVITY * np.array([*across, -np.sqrt(1.0 - across @ across)])
+            self._data.qpos[:], self._data.qvel[:] = state, 0.0
+            self._step(*TILTING)
+            for name, T in self.poses().items():
+                gone[name] = max(gone[name], _moved(parts[name], resting[name], T))
+        return {name: far for name, far in gone.items() if far > self._config.wobble}
 
 
 def _add_component(
