@@ -29,6 +29,8 @@ CLEAR = 0.9
 """Share of its height that has to be free above a face: boards and drawers are thin, and take little of it."""
 MOST_TAKEN = 0.15
 """Share of it that the model may take."""
+SAME_WAY = float(np.cos(np.radians(30.0)))
+"""Cosine between the up-axes of models that lie on the same side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,18 +181,33 @@ def _kept(
 def _well_aligned(
     name: str, ranks: Sequence[int], candidates: Sequence[CadCandidate], config: SelectionConfig, out: Selection
 ) -> list[int]:
-    """Those of the ranks that are not far worse aligned than the best: a book on its edge does not lie down for a push.
+    """Those of the ranks that are not far worse aligned than the best, and lie on the same side as the first.
 
-    Its own mesh counts as well aligned.
+    A book on its edge does not lie down for a push, nor does a bottle stand on its head. Its own mesh counts as well
+    aligned.
     """
     errors = {rank: 0.0 if is_own(candidates[rank]) else candidates[rank].alignment_error for rank in ranks}
     models = [rank for rank in ranks if not is_own(candidates[rank])]
     least = min((errors[rank] for rank in models), default=0.0)
     good = [rank for rank in ranks if errors[rank] <= config.far_worse * least + config.slack]
-    for rank in set(ranks) - set(good):
-        reason = f"is aligned far worse, AE {1e3 * errors[rank]:.0f} mm and not {1e3 * least:.0f} mm"
+    reasons = {
+        rank: f"is aligned far worse, AE {1e3 * errors[rank]:.0f} mm and not {1e3 * least:.0f} mm"
+        for rank in ranks
+        if rank not in good
+    }
+    best = candidates[min((rank for rank in good if rank in models), default=ranks[0])]
+    turned = [rank for rank in good if not is_own(candidates[rank]) and not _same_way_up(candidates[rank], best)]
+    reasons |= dict.fromkeys(turned, "lies on another side than the one that is aligned best")
+    for rank, reason in reasons.items():
         out.rejected.setdefault(name, []).append(Rejection(rank, candidates[rank].model.name, reason))
-    return good
+    return [rank for rank in good if rank not in turned]
+
+
+def _same_way_up(first: CadCandidate, second: CadCandidate) -> bool:
+    """Whether two models lie on the same side; what does not stand upright may lie on either of its faces."""
+    cosine = float(first.T_map_model[:3, 2] @ second.T_map_model[:3, 2])
+    tipped = abs(float(second.T_map_model[2, 2])) < SAME_WAY
+    return (abs(cosine) if tipped else cosine) > SAME_WAY
 
 
 def place_of(

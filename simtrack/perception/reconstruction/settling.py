@@ -47,7 +47,7 @@ class SettlingConfig:
 
     shift: float = 0.05
     """Metres that a centre of mass may move."""
-    turn: float = float(np.radians(20.0))
+    turn: float = float(np.radians(12.0))
     """Radians that a body may turn away from its pose."""
     rest: float = 0.001
     """Metres of motion of any of its points up to which a body is at rest where it is, and stays exactly there."""

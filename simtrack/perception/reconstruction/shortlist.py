@@ -43,8 +43,8 @@ class ShortlistConfig:
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     upright: int = 40
     """Upright matches of lowest ME that are aligned coarsely."""
-    tipped: int = 3
-    """Other matches of lowest ME, likewise."""
+    tipped: int = 12
+    """Other matches of lowest ME, likewise: ME ranks what lies by planes that a thin thing hardly has."""
     advantage: float = 0.4
     """Share of the best upright candidate's error below which a tipped one goes before it: things stand as they are
     made to."""
@@ -55,12 +55,14 @@ class ShortlistConfig:
     unseen_front: float = 0.3
     """Factor, added to 1, on the error of an articulated candidate whose front nobody saw where its rear was seen:
     rears stand against walls."""
+    natural_size: float = 0.25
+    """What a scale that is off by a factor of e adds to the error, relative to it: things have their usual sizes."""
     opened: int = 3
     """Candidates of articulated models for which open positions of the joints are tried; all of them where the smallest
     box is not that of the carcass: something stands open."""
 
     def __post_init__(self) -> None:
-        for name in ("upright", "tipped", "opened", "access", "unseen_front"):
+        for name in ("upright", "tipped", "opened", "access", "unseen_front", "natural_size"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InvalidValueError(f"ShortlistConfig.{name}", getattr(self, name), "0 or more")
         if not 0.0 < self.advantage <= 1.0 or not 1.0 <= self.blocked_front < np.inf:
@@ -163,7 +165,7 @@ def ranking_error(fit: Fit, view: EntityView, free: Float64, config: ShortlistCo
         free: (4,) metres from each of `SIDES` to a wall.
         config: the factors.
     """
-    error = fit.error
+    error = fit.error * (1.0 + config.natural_size * abs(float(fit.unknowns[0])))
     if fit.match.orientation not in UPRIGHT:
         return error / config.advantage
     if not fit.match.model.articulated:
