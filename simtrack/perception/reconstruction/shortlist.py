@@ -27,6 +27,8 @@ from simtrack.perception.scene_graph.contact import ContactGraph, EntityKind, En
 
 _WALL_AREA = 0.5
 """Square metres of the planes that count as walls."""
+FACING_THE_ROOM = {"monitor": 0.5, "sofa": 0.5}
+"""Class of what is looked at or sat on from its front -> metres that its front needs to a wall."""
 _UNSEEN_SIDES = 2
 """Sides of the box that may not have been seen of what is believed to lie."""
 _FLAT = 0.3
@@ -49,9 +51,10 @@ class ShortlistConfig:
     """Share of the best upright candidate's error below which a tipped one goes before it: things stand as they are
     made to."""
     blocked_front: float = 1.5
-    """Factor on the error of an articulated candidate whose front faces a wall: nobody could open it."""
+    """Factor on the error of a candidate whose front faces a wall, if it is articulated or one of `FACING_THE_ROOM`:
+    nobody could open it, or look at it."""
     access: float = 0.3
-    """Metres that a front needs to a wall."""
+    """Metres that the front of what is articulated needs to a wall."""
     unseen_front: float = 0.3
     """Factor, added to 1, on the error of an articulated candidate whose front nobody saw where its rear was seen:
     rears stand against walls."""
@@ -168,11 +171,15 @@ def ranking_error(fit: Fit, view: EntityView, free: Float64, config: ShortlistCo
     error = fit.error * (1.0 + config.natural_size * abs(float(fit.unknowns[0])))
     if fit.match.orientation not in UPRIGHT:
         return error / config.advantage
-    if not fit.match.model.articulated:
+    model = fit.match.model
+    if not (model.articulated or model.semantic_class in FACING_THE_ROOM):
         return error
     side = int(np.argmax(SIDES @ -fit.T_box_model[:2, 1]))
-    if free[side] < config.access <= free[(side + 2) % 4]:
+    access = config.access if model.articulated else FACING_THE_ROOM[model.semantic_class]
+    if free[side] < access <= free[(side + 2) % 4]:
         error *= config.blocked_front
+    if not model.articulated:
+        return error
     front, rear = view.facing_sides[side], view.facing_sides[(side + 2) % 4]
     return error * (1.0 + config.unseen_front * max(0.0, rear - front) / max(rear + front, 1e-9))
 
