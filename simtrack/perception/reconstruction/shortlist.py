@@ -9,6 +9,7 @@ at whether the front could be used.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.boxes import OrientedBox
 from simtrack.geometry.meshes import face_areas, face_normals
+from simtrack.geometry.transforms import apply
 from simtrack.geometry.upright_boxes import MIN_SIDE
 from simtrack.objects.cad import CadModel
 from simtrack.perception.reconstruction.alignment import AlignmentConfig
@@ -190,20 +192,41 @@ def front_clearances(view: EntityView, graph: ContactGraph) -> Float64:
     directions = np.column_stack([SIDES, np.zeros(4)]) @ T[:3, :3].T
     middles = T[:3, 3] + (np.abs(SIDES) @ half[:2])[:, None] * directions
     free = np.full(4, np.inf)
-    for wall in graph.nodes.values():
-        if wall.kind is not EntityKind.LAYOUT or wall.shape is None:
-            continue
-        for plane, outline in zip(wall.planes, wall.shape.outlines, strict=False):
-            facing = np.flatnonzero((directions @ plane.normal < -0.7) & (plane.area > _WALL_AREA))
-            for side in facing if abs(plane.normal[2]) < 0.1 else ():
-                distance = float(plane.distance(middles[side]))
-                at = middles[side] - distance * plane.normal
-                corners = outline @ wall.T_map_entity[:3, :3].T + wall.T_map_entity[:3, 3]
-                if (at[:2] >= corners[:, :2].min(axis=0) - 0.05).all() and (
-                    at[:2] <= corners[:, :2].max(axis=0) + 0.05
-                ).all():
-                    free[side] = min(free[side], max(distance, 0.0))
+    walls = _wall_planes(graph)
+    facing = directions @ walls.normals.T < -0.7
+    distances = middles @ walls.normals.T + walls.offsets
+    for side, wall in np.argwhere(facing).tolist():
+        at = (middles[side] - distances[side, wall] * walls.normals[wall])[:2]
+        if (at >= walls.low[wall] - 0.05).all() and (at <= walls.high[wall] + 0.05).all():
+            free[side] = min(free[side], max(float(distances[side, wall]), 0.0))
     return free
+
+
+@dataclass(frozen=True, slots=True)
+class _WallPlanes:
+    """Upright planes of layout: (N, 3) normals, (N,) offsets, (N, 2) lower and upper corners of x, y."""
+
+    normals: Float64
+    offsets: Float64
+    low: Float64
+    high: Float64
+
+
+@lru_cache(maxsize=2)
+def _wall_planes(graph: ContactGraph) -> _WallPlanes:
+    found = [
+        (plane, apply(wall.T_map_entity, outline)[:, :2])
+        for wall in graph.nodes.values()
+        if wall.kind is EntityKind.LAYOUT and wall.shape is not None
+        for plane, outline in zip(wall.planes, wall.shape.outlines, strict=False)
+        if abs(plane.normal[2]) < 0.1 and plane.area > _WALL_AREA
+    ]
+    return _WallPlanes(
+        np.array([plane.normal for plane, _ in found]).reshape(-1, 3),
+        np.array([plane.offset for plane, _ in found]),
+        np.array([corners.min(axis=0) for _, corners in found]).reshape(-1, 2),
+        np.array([corners.max(axis=0) for _, corners in found]).reshape(-1, 2),
+    )
 
 
 def _candidate(view: EntityView, fit: Fit, T_back: Float64) -> CadCandidate:
