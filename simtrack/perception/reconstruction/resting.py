@@ -13,7 +13,7 @@ from simtrack.perception.reconstruction.candidates import CadCandidate
 from simtrack.perception.reconstruction.kinematic_tree import body_names, kinematic_tree
 from simtrack.perception.reconstruction.own_model import is_own
 from simtrack.perception.reconstruction.selection import Selection, SelectionConfig, select
-from simtrack.perception.reconstruction.settling import Settled, SettlingConfig, settle
+from simtrack.perception.reconstruction.settling import Known, Settled, SettlingConfig, settle
 from simtrack.perception.reconstruction.snapping import Snapped, SnappingConfig, snap
 from simtrack.perception.scene_graph.contact.graph import ContactGraph
 
@@ -90,6 +90,7 @@ class _Resting:
     ) -> None:
         self.graph, self.shortlists, self.config, self.ground = graph, shortlists, config, ground
         self.bodies = body_names(graph)
+        self.known: Known = {}
         self.entities = {body: entity for entity, body in self.bodies.items()}
 
     def run(self, selection: Selection) -> Rest:
@@ -103,7 +104,7 @@ class _Resting:
         """At the poses that the bodies settle at from where they are placed."""
         snapped = rest.snapped
         tree = kinematic_tree("scene", self.graph, rest.placed, self.ground, snapped.parts, snapped.resting, rest.fixed)
-        settled = settle(tree, self.config.settling)
+        settled = settle(tree, self.config.settling, self.known)
         placed = {
             entity: replace(candidate, T_map_model=settled.poses.get(self.bodies[entity], candidate.T_map_model))
             for entity, candidate in rest.placed.items()

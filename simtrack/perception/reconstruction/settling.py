@@ -10,16 +10,17 @@ each side, and what moves then is reported as wobbly. Joints of articulated mode
 scene is another engine, see `simtrack.plausibility`.
 """
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import apply, inverse, quaternion_from_rotation, transform
-from simtrack.perception.reconstruction.body_tree import Body, BodyTree, Component, Shape
+from simtrack.perception.reconstruction.body_tree import Body, BodyTree, Shape, collision_points
 
 if TYPE_CHECKING:
     import mujoco
@@ -113,11 +114,114 @@ class Settled:
         return f"moves by {1e3 * self.wobbly[body]:.0f} mm when the scene is tilted a little"
 
 
-def settle(tree: BodyTree, config: SettlingConfig | None = None) -> Settled:
-    """Let the free components of a tree come to rest; the others, and all joints, stay."""
+def settle(tree: BodyTree, config: SettlingConfig | None = None, known: "Known | None" = None) -> Settled:
+    """Let the free components of a tree come to rest; the others, and all joints, stay.
+
+    Components that are so far apart that they cannot meet settle one group after the other.
+
+    Args:
+        tree: the scene.
+        config: bounds.
+        known: groups that settled before; those that are as they were then are not simulated again. New ones are added.
+    """
     config = config or SettlingConfig()
-    parts = {part.name: part for part in tree.components if not part.static}
-    start = {name: np.asarray(part.T_scene_root, float) for name, part in parts.items()}
+    known = {} if known is None else known
+    scenery, groups = _grouped(tree, config)
+    poses: dict[str, Float64] = {}
+    held: dict[str, Motion] = {}
+    stuck: dict[str, float] = {}
+    wobbly: dict[str, float] = {}
+    for group in groups:
+        near = scenery.near(group, config)
+        key = _digest([*group, *near], config)
+        if key not in known:
+            known[key] = _settled(group, near, config)
+        found = known[key]
+        for whole, part in ((poses, found.poses), (held, found.held), (stuck, found.stuck), (wobbly, found.wobbly)):
+            whole.update(part)
+    return Settled(poses, held, stuck, wobbly)
+
+
+Known: TypeAlias = dict[bytes, Settled]
+"""What settled before: digest of a group of components and of what is near it -> where it comes to rest."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rigid:
+    """Shapes that move as one, in the scene."""
+
+    name: str
+    T_scene_root: Float64
+    bodies: tuple[tuple[Body, Float64], ...]
+    """With T_scene_body (4, 4)."""
+    corners: Float64
+    """(N, 3) of all shapes, scene."""
+
+    @staticmethod
+    def of(name: str, T_scene_root: Float64, bodies: Sequence[Body], poses: Mapping[str, Float64]) -> "_Rigid":
+        """Bodies at T_scene_body (4, 4)."""
+        placed = tuple((body, poses[body.name]) for body in bodies)
+        return _Rigid(name, T_scene_root, placed, collision_points(bodies, poses))
+
+
+class _Scenery:
+    """What does not move, shape by shape."""
+
+    def __init__(self, bodies: Sequence[Body], poses: Mapping[str, Float64]) -> None:
+        self._parts = [
+            _Rigid.of(f"{body.name}/{k}", np.eye(4), (replace(body, collision=(shape,)),), poses)
+            for body in bodies
+            for k, shape in enumerate(body.collision)
+        ]
+        self._low = np.array([part.corners.min(axis=0) for part in self._parts]).reshape(-1, 3)
+        self._high = np.array([part.corners.max(axis=0) for part in self._parts]).reshape(-1, 3)
+
+    def near(self, group: Sequence[_Rigid], config: SettlingConfig) -> list[_Rigid]:
+        """What a group could meet."""
+        corners = np.concatenate([part.corners for part in group])
+        low, high = corners.min(axis=0) - 2.0 * config.shift, corners.max(axis=0) + 2.0 * config.shift
+        close = (np.maximum(self._low - high, low - self._high) <= 0.0).all(axis=1)
+        return [self._parts[k] for k in np.flatnonzero(close)]
+
+
+def _grouped(tree: BodyTree, config: SettlingConfig) -> tuple[_Scenery, list[list[_Rigid]]]:
+    """What does not move, and the free components in groups that are too far apart to meet."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    poses = tree.forward()
+    scenery = _Scenery([body for part in tree.components if part.static for body in part.bodies], poses)
+    free = [
+        _Rigid.of(part.name, np.asarray(part.T_scene_root, float), part.bodies, poses)
+        for part in tree.components
+        if not part.static
+    ]
+    spans = [part.corners if len(part.corners) else part.T_scene_root[None, :3, 3] for part in free]
+    low = np.array([span.min(axis=0) for span in spans]).reshape(-1, 3) - config.shift
+    high = np.array([span.max(axis=0) for span in spans]).reshape(-1, 3) + config.shift
+    apart = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).max(axis=2, initial=-np.inf)
+    _, labels = connected_components(coo_array(apart <= 0.0), directed=False)
+    return scenery, [[free[k] for k in np.flatnonzero(labels == label)] for label in np.unique(labels)]
+
+
+def _digest(parts: Sequence[_Rigid], config: SettlingConfig) -> bytes:
+    """Of all that decides where things come to rest."""
+    found = blake2b(repr(config).encode(), digest_size=16)
+    for part in parts:
+        found.update(f"{part.name} {len(part.corners)}".encode())
+        found.update(np.ascontiguousarray(part.corners).tobytes() + part.T_scene_root.tobytes())
+        for body, T in part.bodies:
+            assert body.centre_of_mass is not None and body.inertia is not None
+            found.update(
+                np.array([body.mass, body.friction, *body.centre_of_mass, *body.inertia.ravel(), *T.ravel()]).tobytes()
+            )
+    return found.digest()
+
+
+def _settled(group: Sequence[_Rigid], near: Sequence[_Rigid], config: SettlingConfig) -> Settled:
+    """One group at rest."""
+    parts = {part.name: part for part in group}
+    start = {name: part.T_scene_root for name, part in parts.items()}
     held: dict[str, Motion] = {}
     depths: dict[str, float] = {}
     wobbly: dict[str, float] = {}
@@ -125,15 +229,15 @@ def settle(tree: BodyTree, config: SettlingConfig | None = None) -> Settled:
     for _ in range(config.rounds):
         if len(held) == len(start):
             break
-        simulation = _Simulation(tree, held, config)
+        simulation = _Simulation(group, near, held, config)
         simulation.rest()
         found, depths = simulation.poses(), simulation.depths()
-        motions = {name: _motion(tree.by_name[name], start[name], T) for name, T in found.items()}
+        motions = {name: _motion(parts[name].bodies[0][0], start[name], T) for name, T in found.items()}
         far = {n: m for n, m in motions.items() if not (m.shift <= config.shift and m.turn <= config.turn)}
         poses = {**start, **{name: T for name, T in found.items() if name not in far}}
         held |= far
         if not far:
-            wobbly = simulation.wobbling(parts)
+            wobbly = simulation.wobbling()
             break
     kept = {name: T if _moved(parts[name], start[name], T) > config.rest else start[name] for name, T in poses.items()}
     stuck = {name: depths[name] for name in start if depths.get(name, 0.0) > config.depth}
@@ -141,9 +245,11 @@ def settle(tree: BodyTree, config: SettlingConfig | None = None) -> Settled:
 
 
 class _Simulation:
-    """A tree in MuJoCo, every component rigid; those that are held are fixed."""
+    """A group of components and what is near it in MuJoCo, every component rigid; those that are held are fixed."""
 
-    def __init__(self, tree: BodyTree, held: Collection[str], config: SettlingConfig) -> None:
+    def __init__(
+        self, group: Sequence[_Rigid], near: Sequence[_Rigid], held: Collection[str], config: SettlingConfig
+    ) -> None:
         import mujoco
 
         spec = mujoco.MjSpec()
@@ -151,10 +257,9 @@ class _Simulation:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = 10.0
-        local = tree.forward()
-        self._free = [part.name for part in tree.components if not part.static and part.name not in held]
-        for part in tree.components:
-            _add_component(spec, part, local, config, loose=part.name in self._free)
+        self._free = {part.name: part for part in group if part.name not in held}
+        for part in (*group, *near):
+            _add(spec, part, config, loose=part.name in self._free)
         self._config = config
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
@@ -180,7 +285,7 @@ class _Simulation:
         return {name: transform(state.xmat.reshape(3, 3).copy(), state.xpos.copy()) for name, state in states.items()}
 
     def depths(self) -> dict[str, float]:
-        """All components -> metres that they are in others; those that touch nothing are missing."""
+        """Components -> metres that they are in others; those that touch nothing are missing."""
         found: dict[str, float] = {}
         for contact in self._data.contact:
             for geom in contact.geom:
@@ -188,8 +293,8 @@ class _Simulation:
                 found[name] = max(found.get(name, 0.0), -float(contact.dist))
         return found
 
-    def wobbling(self, parts: Mapping[str, Component]) -> dict[str, float]:
-        """Free components that move too far when the scene is tilted, and how far, metres. It is put back at rest."""
+    def wobbling(self) -> dict[str, float]:
+        """Free components that move too far when the scene is tilted, and how far, metres."""
         if self._config.tilt == 0.0:
             return {}
         resting, state = self.poses(), self._data.qpos.copy()
@@ -200,37 +305,35 @@ class _Simulation:
             self._data.qpos[:], self._data.qvel[:] = state, 0.0
             self._step(*TILTING)
             for name, T in self.poses().items():
-                gone[name] = max(gone[name], _moved(parts[name], resting[name], T))
+                gone[name] = max(gone[name], _moved(self._free[name], resting[name], T))
         return {name: far for name, far in gone.items() if far > self._config.wobble}
 
 
-def _add_component(
-    spec: "mujoco.MjSpec", part: Component, poses: Mapping[str, Float64], config: SettlingConfig, *, loose: bool
-) -> None:
-    """One body for the root and one for each other body of the component, all rigidly in one."""
-    root = None
-    for body in part.bodies:
-        T_scene_body = poses[body.name]
-        if root is None:
-            made = root = spec.worldbody.add_body(name=body.name, **_pose(T_scene_body))
-            if loose:
-                made.add_freejoint()
-        else:
-            made = root.add_body(name=body.name, **_pose(inverse(part.T_scene_root) @ T_scene_body))
-        if body.mass > 0.0:
+def _add(spec: "mujoco.MjSpec", part: _Rigid, config: SettlingConfig, *, loose: bool) -> None:
+    """One body for the root and one for each other body, all rigidly in one."""
+    root = spec.worldbody.add_body(name=part.name, **_pose(part.T_scene_root))
+    if loose:
+        root.add_freejoint()
+    T_root_scene = inverse(part.T_scene_root)
+    for k, (body, T_scene_body) in enumerate(part.bodies):
+        made = root if k == 0 else root.add_body(name=body.name, **_pose(T_root_scene @ T_scene_body))
+        if loose and body.mass > 0.0:
             moments, T_body_principal = body.principal_inertia()
             made.explicitinertial = True
             made.mass, made.inertia = body.mass, moments
             made.ipos, made.iquat = T_body_principal[:3, 3], quaternion_from_rotation(T_body_principal[:3, :3])
-        for k, shape in enumerate(body.collision):
-            _add_shape(spec, made, f"{body.name}/{k}", shape, config.friction * body.friction)
+        T_made_body = T_root_scene @ T_scene_body if k == 0 else np.eye(4)
+        for number, shape in enumerate(body.collision):
+            _add_shape(spec, made, f"{part.name}/{k}/{number}", shape, T_made_body, config.friction * body.friction)
 
 
-def _add_shape(spec: "mujoco.MjSpec", body: Any, name: str, shape: Shape, friction: float) -> None:
+def _add_shape(
+    spec: "mujoco.MjSpec", body: Any, name: str, shape: Shape, T_made_body: Float64, friction: float
+) -> None:
     import mujoco
 
     kinds = mujoco.mjtGeom
-    geom = body.add_geom(mass=0.0, **_pose(shape.pose))
+    geom = body.add_geom(mass=0.0, **_pose(T_made_body @ shape.pose))
     geom.friction[0] = friction
     geom.solref[:] = STIFF
     if shape.mesh is not None:
@@ -258,8 +361,7 @@ def _motion(body: Body, T_start: Float64, T_end: Float64) -> Motion:
     return Motion(shift, float(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def _moved(part: Component, T_start: Float64, T_end: Float64) -> float:
-    """Largest distance that a corner of the root's shapes went, metres."""
-    corners = [shape.corners() for shape in part.bodies[0].collision]
-    points = np.concatenate(corners) if corners else np.zeros((1, 3))
+def _moved(part: _Rigid, T_start: Float64, T_end: Float64) -> float:
+    """Largest distance that a corner of the shapes goes when the root goes from one pose to another, metres."""
+    points = apply(inverse(part.T_scene_root), part.corners) if len(part.corners) else np.zeros((1, 3))
     return float(np.linalg.norm(apply(T_end, points) - apply(T_start, points), axis=1).max())
