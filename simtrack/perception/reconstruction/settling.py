@@ -127,19 +127,19 @@ def settle(tree: BodyTree, config: SettlingConfig | None = None, known: "Known |
     config = config or SettlingConfig()
     known = {} if known is None else known
     scenery, groups = _grouped(tree, config)
-    poses: dict[str, Float64] = {}
-    held: dict[str, Motion] = {}
-    stuck: dict[str, float] = {}
-    wobbly: dict[str, float] = {}
+    found: list[Settled] = []
     for group in groups:
         near = scenery.near(group, config)
         key = _digest([*group, *near], config)
         if key not in known:
             known[key] = _settled(group, near, config)
-        found = known[key]
-        for whole, part in ((poses, found.poses), (held, found.held), (stuck, found.stuck), (wobbly, found.wobbly)):
-            whole.update(part)
-    return Settled(poses, held, stuck, wobbly)
+        found.append(known[key])
+    return Settled(
+        poses={name: T for part in found for name, T in part.poses.items()},
+        held={name: motion for part in found for name, motion in part.held.items()},
+        stuck={name: depth for part in found for name, depth in part.stuck.items()},
+        wobbly={name: far for part in found for name, far in part.wobbly.items()},
+    )
 
 
 Known: TypeAlias = dict[bytes, Settled]
