@@ -60,7 +60,7 @@ class SettlingConfig:
     """Of holding what went too far and settling the others again; 0: nothing settles."""
     tilt: float = float(np.radians(2.0))
     """Radians by which the scene at rest is tilted to each side; 0: it is not."""
-    wobble: float = 0.01
+    wobble: float = 0.02
     """Metres of motion of any of its points from which a body that is tilted so is wobbly."""
 
     def __post_init__(self) -> None:
