@@ -119,14 +119,14 @@ def test_rooms_that_are_done_are_not_done_again(tmp_path: Path, monkeypatch: pyt
     tasks = [RoomTask(seed, False, "true", "graph") for seed in (1, 2)]
     ran: list[str] = []
 
-    def results(tasks: list[RoomTask], _workers: int):
+    def results(tasks: list[RoomTask], _run: object, _workers: int):
         for task in tasks:
             ran.append(task.room)
             yield task, room(task.room)
             if len(ran) == 1:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(reconstruction_rooms, "_results", results)
+    monkeypatch.setattr(reconstruction_rooms, "as_done", results)
     with pytest.raises(KeyboardInterrupt):
         evaluate_rooms(tasks, tmp_path, 1)
     told: list[tuple[int, int]] = []
