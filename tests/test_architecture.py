@@ -36,18 +36,7 @@ ROOMS = (
 )
 """From top to bottom: a room imports only from itself and from rooms above it."""
 
-HIDDEN_FROM_PERCEPTION = {
-    "simulation",
-    "recordings",
-    "datasets",
-    "training",
-    "evaluation",
-    "envs",
-    "report",
-    "testing",
-    "benchmarks",
-    "cli",
-}
+HIDDEN_FROM_PERCEPTION = set(ROOMS[ROOMS.index("simulation") :])
 HEAVY = {"numba", "scipy", "trimesh", "cv2", "mujoco", "skimage", "shapely", "pyoxigraph", "matplotlib", "embreex"}
 HEAVY |= {"pydantic", "manifold3d", "mcap", "rerun", "tyro", "rich", "ray", "torch", "onnx", "onnxruntime"}
 IMPORT_NAMES = {
