@@ -26,6 +26,18 @@ class Observation:
     """Global segments l, the largest first."""
 
 
+@dataclass(frozen=True, slots=True)
+class SegmentEntity:
+    """What a global segment is part of."""
+
+    semantic_class: str
+    instance: int
+    agreeing: int
+    """Observations of the segment that say so ..."""
+    observed: int
+    """... of so many."""
+
+
 class PanopticCounts(Protocol):
     """Keeps and interprets counts."""
 
@@ -45,8 +57,8 @@ class PanopticCounts(Protocol):
         """Merge instances that are one."""
         ...
 
-    def entities(self) -> Mapping[int, tuple[str, int]]:
-        """Global segment -> its class and instance; background is missing."""
+    def entities(self) -> Mapping[int, SegmentEntity]:
+        """Global segment -> what it is part of; background is missing."""
         ...
 
 
@@ -117,7 +129,7 @@ class JointCounts:
     def alike(self, label: int, other: int) -> bool:
         """Whether both are the same entity, or one of them none."""
         first, second = self._entity(label), self._entity(other)
-        return first is None or second is None or first == second
+        return first is None or second is None or _key(first) == _key(second)
 
     def regularize(self) -> None:
         """Eq. 5: merge two instances of a class that were long associated with common segments."""
@@ -140,12 +152,12 @@ class JointCounts:
                     break
                 self._merge_instances(name, instances[max(first, second)], instances[min(first, second)])
 
-    def entities(self) -> Mapping[int, tuple[str, int]]:
+    def entities(self) -> Mapping[int, SegmentEntity]:
         """Eq. 6."""
         found = ((label, self._entity(label)) for label in sorted(self.phi))
         return {label: entity for label, entity in found if entity is not None}
 
-    def _entity(self, label: int) -> tuple[str, int] | None:
+    def _entity(self, label: int) -> SegmentEntity | None:
         classes: dict[str, int] = defaultdict(int)
         counts = self.phi.get(label, {})
         for (name, _), count in counts.items():
@@ -153,7 +165,8 @@ class JointCounts:
         name = _winner(classes, self.config.labelled)
         if name is None:
             return None
-        return name, max(((count, -p) for (c, p), count in counts.items() if c == name))[1] * -1
+        count, negative = max((count, -p) for (c, p), count in counts.items() if c == name)
+        return SegmentEntity(name, -negative, count, sum(counts.values()))
 
     def _table(self, name: str) -> tuple[list[int], list[int], np.ndarray]:
         """Segments, instances and (L, P) float64 counts of a class."""
@@ -220,7 +233,7 @@ class SeparateCounts:
     def regularize(self) -> None:
         """Nothing: instances are not merged."""
 
-    def entities(self) -> Mapping[int, tuple[str, int]]:
+    def entities(self) -> Mapping[int, SegmentEntity]:
         """The likeliest instance of each segment; its class is the one that most was counted for on its segments."""
         own: dict[int, int] = {}
         votes: dict[int, dict[str, int]] = defaultdict(lambda: defaultdict(int))
@@ -231,7 +244,13 @@ class SeparateCounts:
                 continue
             own[label] = -max(real)[1]
             votes[own[label]][name] += sum(self.classes[label].values())
-        return {label: (max(sorted(votes[p]), key=votes[p].__getitem__), p) for label, p in own.items()}
+        return {
+            label: SegmentEntity(
+                max(sorted(votes[p]), key=votes[p].__getitem__), p, self.instances[label][p],
+                sum(self.instances[label].values()),
+            )
+            for label, p in own.items()
+        }  # fmt: skip
 
     def _likeliest(self, labels: Iterable[int], taken: Set[int]) -> int:
         for label in labels:
@@ -240,6 +259,10 @@ class SeparateCounts:
                 return -max(free)[1]
         self._fresh += 1
         return self._fresh - 1
+
+
+def _key(entity: SegmentEntity) -> tuple[str, int]:
+    return entity.semantic_class, entity.instance
 
 
 def _winner(classes: Mapping[str, int], labelled: float) -> str | None:

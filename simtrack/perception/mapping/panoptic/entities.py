@@ -1,5 +1,6 @@
 """Entities of a panoptic map as meshes: section 3.4 of the reconstruction paper."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ from simtrack.contracts import Float32, Int32, Uint8
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.meshes import Mesh, face_areas
 from simtrack.perception.mapping.panoptic import surface_kernels as kernels
+from simtrack.perception.mapping.panoptic.counts import SegmentEntity
 from simtrack.perception.mapping.panoptic.volume import Volume
 
 STUFF_FIRST = ("floor", "wall", "ceiling")
@@ -38,6 +40,8 @@ class MapEntityMesh:
     semantic_class: str
     instance: int
     """Global instance p."""
+    score: float
+    """0 to 1: share of the observations of its segments that say that they are this."""
     mesh: Mesh
     """Map frame, faces coloured."""
 
@@ -74,7 +78,7 @@ def extract_surface(volume: Volume, least_weight: float) -> Surface:
 
 
 def extract_entities(
-    volume: Volume, canonical: Int32, entities: Mapping[int, tuple[str, int]], config: EntityConfig | None = None
+    volume: Volume, canonical: Int32, entities: Mapping[int, SegmentEntity], config: EntityConfig | None = None
 ) -> tuple[MapEntityMesh, ...]:
     """One mesh an entity.
 
@@ -86,11 +90,14 @@ def extract_entities(
     """
     config = config or EntityConfig()
     surface = extract_surface(volume, config.least_weight)
-    keys = sorted(set(entities.values()), key=lambda e: (e[0] not in STUFF_FIRST, e[0], e[1]))
+    parts: dict[tuple[str, int], list[SegmentEntity]] = defaultdict(list)
+    for each in entities.values():
+        parts[each.semantic_class, each.instance].append(each)
+    keys = sorted(parts, key=lambda key: (key[0] not in STUFF_FIRST, *key))
     number = {key: k for k, key in enumerate(keys)}
     of_label = np.full(len(canonical), -1, np.int32)
-    for label, key in entities.items():
-        of_label[label] = number[key]
+    for label, each in entities.items():
+        of_label[label] = number[each.semantic_class, each.instance]
     owner = of_label[canonical][surface.labels]
     order = np.argsort(owner, kind="stable")
     bounds = np.searchsorted(owner[order], np.arange(len(keys) + 1))
@@ -100,7 +107,8 @@ def extract_entities(
         mesh = _part(surface, order[bounds[k] : bounds[k + 1]])
         if len(mesh.faces) and face_areas(mesh).sum() >= config.least_area:
             running[name] = running.get(name, 0) + 1
-            found.append(MapEntityMesh(f"{name}{running[name]}", name, p, mesh))
+            agreeing, observed = (sum(values) for values in zip(*((e.agreeing, e.observed) for e in parts[name, p])))
+            found.append(MapEntityMesh(f"{name}{running[name]}", name, p, agreeing / observed, mesh))
     return tuple(found)
 
 

@@ -24,7 +24,7 @@ class FrameFusionConfig:
     inside: float = 0.9
     """Share of a panoptic segment that must lie in a geometric one to be split out of it ..."""
     part: float = 0.5
-    """... of which it must be less than this share."""
+    """... of which it must be less than this share; one with more outside all geometric segments is one by itself."""
     min_pixels: int = 40
     """Readings, of an image of 640 x 480, that a segment needs which is split out, or which no geometric one covers."""
     covered: float = 0.2
@@ -109,7 +109,8 @@ def _extracted(joint: np.ndarray, least: int, config: FrameFusionConfig) -> np.n
     of_mask = joint / np.maximum(joint.sum(axis=0, keepdims=True), 1)
     of_segment = joint / np.maximum(joint.sum(axis=1, keepdims=True), 1)
     found = (of_mask > config.inside) & (of_segment < config.part)
-    found[0] = True
+    # What no geometric segment covers is on edges, unless that is most of the mask: then it is small or thin.
+    found[0] = of_mask[0] > config.part
     found &= joint >= least
     found[:, 0] = False
     return found
