@@ -65,8 +65,10 @@ class TrueSurface:
 class SeenSurface:
     """Collects what a camera saw of a room: one point a cell and entity."""
 
-    def __init__(self, room: SettledRoom) -> None:
-        self.room = room
+    def __init__(self, room: SettledRoom, max_depth: float = 4.0) -> None:
+        """Of a room; readings farther than `max_depth` metres, which maps do not use, are not taken."""
+        self.room, self._max_depth = room, max_depth
+        self._full: list[Float64] = []
         self._keys = np.empty(0, np.int64)
         self._points = np.empty((0, 3))
 
@@ -75,7 +77,8 @@ class SeenSurface:
         K = seen.frame.intrinsics
         rows = slice(None, None, _PIXELS)
         depth, owners = seen.depth[rows, rows].astype(float), seen.instances[rows, rows]
-        read = (seen.frame.depth[rows, rows] > 0.0) & (owners >= 0)
+        readings = seen.frame.depth[rows, rows]
+        read = (readings > 0.0) & (readings <= self._max_depth) & (owners >= 0)
         v, u = np.nonzero(read)
         z = depth[read]
         local = np.stack([(_PIXELS * u - K.cx) / K.fx * z, (_PIXELS * v - K.cy) / K.fy * z, z], axis=1)
@@ -90,7 +93,9 @@ class SeenSurface:
         owners = self._keys % _KEY
         seen = [self._points[owners == k] for k in range(len(room.entities))]
         rng = np.random.default_rng(0)
-        full = [_spread(entity.mesh, k, rng) for k, entity in enumerate(room.entities)]
+        if not self._full:
+            self._full = [_spread(entity.mesh, k, rng) for k, entity in enumerate(room.entities)]
+        full = self._full
         shares = np.array([len(a) / max(len(b), 1) for a, b in zip(seen, full, strict=True)])
         entities, void, stuff = [], [], set()
         for number, entity in enumerate(room.entities):
@@ -117,7 +122,7 @@ def _cells(points: Float64, owners: np.ndarray) -> np.ndarray:
 
 def _spread(mesh: Mesh, number: int, rng: np.random.Generator) -> Float64:
     """(N, 3), a point of a mesh's surface for each cell that it passes."""
-    points, _ = sample_surface(mesh, max(64, round(16.0 * area(mesh) / CELL**2)), rng)
+    points, _ = sample_surface(mesh, max(64, round(4.0 * area(mesh) / CELL**2)), rng)
     return points[np.unique(_cells(points, np.full(len(points), number)), return_index=True)[1]]
 
 

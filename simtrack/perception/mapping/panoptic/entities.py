@@ -20,7 +20,7 @@ STUFF_FIRST = ("floor", "wall", "ceiling")
 class EntityConfig:
     """Settings of `extract_entities`."""
 
-    least_weight: float = 1.0
+    least_weight: float = 0.2
     """1/m^2: voxels of less weight (one reading at a metre has 1) count as unseen."""
     least_area: float = 0.002
     """Square metres; smaller entities are dropped."""
