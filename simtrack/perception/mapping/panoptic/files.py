@@ -9,10 +9,13 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from simtrack.errors import FileFormatError, MeshError
-from simtrack.geometry.meshes import load_mesh
+from simtrack.geometry.meshes import Mesh, load_mesh
 from simtrack.objects.export import write_ply
-from simtrack.perception.mapping.panoptic.entities import MapEntityMesh
+from simtrack.perception.mapping.panoptic.entities import MapEntityMesh, extract_surface
+from simtrack.perception.mapping.panoptic.panoptic_map import PanopticMap
 
 LISTING, FOLDER = "entities.json", "entities"
 MOST_BYTES, MOST_ENTITIES = 10_000_000, 10_000
@@ -34,6 +37,23 @@ def write_entities(entities: Sequence[MapEntityMesh], folder: Path) -> list[str]
         )
     (folder / LISTING).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return [LISTING, *(str(row["file"]) for row in rows)]
+
+
+def write_surface(panoptic_map: PanopticMap, entities: Sequence[MapEntityMesh], path: Path) -> None:
+    """Write the whole surface of a map in one PLY file; class_id and instance of a vertex are 0 where there is none."""
+    surface = extract_surface(panoptic_map.volume, panoptic_map.config.entities.least_weight)
+    classes = {name: k for k, name in enumerate(sorted({entity.semantic_class for entity in entities}), start=1)}
+    known = {(entity.semantic_class, entity.instance) for entity in entities}
+    canonical = panoptic_map.labels.canonical
+    ids = np.zeros((len(canonical), 2), np.int32)
+    for label, each in panoptic_map.counts.entities().items():
+        if (each.semantic_class, each.instance) in known:
+            ids[label] = classes[each.semantic_class], each.instance
+    of_vertex = np.zeros((len(surface.vertices), 2), np.int32)
+    of_vertex[surface.faces] = ids[canonical[surface.labels]][:, None]
+    mesh = Mesh(surface.vertices, surface.faces, surface.colors[surface.faces[:, 0]])
+    comments = [f"class_id {number} {name}" for name, number in classes.items()]
+    write_ply(path, mesh, labels={"class_id": of_vertex[:, 0], "instance": of_vertex[:, 1]}, comments=comments)
 
 
 def read_entities(folder: Path) -> tuple[MapEntityMesh, ...]:
