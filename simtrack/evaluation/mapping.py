@@ -1,14 +1,14 @@
 """Maps a source, and measures the map against the truth where that is known."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from simtrack.contracts import Float64, Status
 from simtrack.evaluation.map_sources import MapSource
-from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
+from simtrack.evaluation.metrics import Metrics, measured, ratio, unmeasured
 from simtrack.evaluation.panoptic import (
     PAPER_CLASSES,
     STUFF,
@@ -24,9 +24,10 @@ from simtrack.evaluation.panoptic import (
     predicted_entity,
     scored_classes,
 )
+from simtrack.geometry.boxes import OrientedBox
 from simtrack.perception.mapping.panoptic.entities import MapEntityMesh
 from simtrack.perception.mapping.panoptic.panoptic_map import PanopticMap, PanopticMapConfig
-from simtrack.perception.segmentation.panoptic import Segmenter
+from simtrack.perception.segmentation.geometric import depth_segments
 from simtrack.simulation.building.rooms.physics import SettledRoom
 
 SURFACE_NEAR = 0.02
@@ -61,26 +62,40 @@ def map_scene(
         config: of the map.
         progress: hears how many frames of how many are done.
     """
-    panoptic_map, seconds = PanopticMap(config), 0.0
-    seen = None if source.room is None else SeenSurface(source.room)
+    return map_scenes(source, [config or PanopticMapConfig()], progress)[0]
+
+
+def map_scenes(
+    source: MapSource, configs: Sequence[PanopticMapConfig], progress: Callable[[int, int], None] | None = None
+) -> tuple[MappedScene, ...]:
+    """Fuse all frames of a source into several maps, which get the same segments; see `map_scene`."""
+    maps, seconds = [PanopticMap(config) for config in configs], np.zeros(len(configs))
+    seen = None if source.room is None else SeenSurface(source.room, maps[0].config.max_depth)
     with source.held:
         for number, entry in enumerate(source.frames(), start=1):
-            segments = segmented(source.segmenter, entry.frame)
-            start = time.process_time()
-            update = panoptic_map.integrate(entry.frame, entry.T_map_camera, segments)
-            seconds += time.process_time() - start
-            if seen is not None and entry.truth is not None and update.status is Status.OK:
+            segments = source.segmenter.segment(entry.frame)
+            geometric, first = None, 0.0
+            if len(maps) > 1:  # all take the same
+                start, far = time.process_time(), entry.frame.depth > maps[0].config.max_depth
+                depth = np.where(far, np.float32(0.0), entry.frame.depth)
+                geometric = depth_segments(depth, entry.frame.intrinsics, maps[0].config.geometric)
+                first = time.process_time() - start
+            used = False
+            for k, panoptic_map in enumerate(maps):
+                start = time.process_time()
+                update = panoptic_map.integrate(entry.frame, entry.T_map_camera, segments, geometric)
+                seconds[k] += time.process_time() - start + first
+                used = used or update.status is Status.OK
+            if seen is not None and entry.truth is not None and used:
                 seen.add(entry.truth)
             if progress is not None:
                 progress(number, source.count)
-    start = time.process_time()
-    entities = panoptic_map.entities()
-    return MappedScene(source.name, panoptic_map, entities, seen, seconds + time.process_time() - start)
-
-
-def segmented(segmenter: Segmenter, frame):  # noqa: ANN001, ANN201
-    """What a segmenter says of a frame, None where it fails."""
-    return segmenter.segment(frame)
+    made = []
+    for panoptic_map, spent in zip(maps, seconds.tolist(), strict=True):
+        start = time.process_time()
+        entities = panoptic_map.entities()
+        made.append(MappedScene(source.name, panoptic_map, entities, seen, spent + time.process_time() - start))
+    return tuple(made)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,17 +117,25 @@ class MapScores:
     completeness: float
     """Share of the surface that was seen that lies within `SURFACE_NEAR` of the map."""
     distance: int
-    """Graph edit distance of the contact graph, 2 W + M + E."""
+    """Graph edit distance of the contact graph, 2 W + M + E; 0 where it was not built."""
     nodes: int
-    """Of the true contact graph, of things that were seen."""
+    """Of the true contact graph, of things that were seen; 0 where it was not built."""
 
 
-def score_map(entities: tuple[MapEntityMesh, ...], seen: SeenSurface) -> MapScores:
-    """Compare the entities of a map with the room that they were seen in."""
+def score_map(entities: tuple[MapEntityMesh, ...], seen: SeenSurface, graph: bool = True) -> MapScores:
+    """Compare the entities of a map with the room that they were seen in.
+
+    Args:
+        entities: of the map.
+        seen: what the camera saw of the room.
+        graph: whether the contact graph is built, which refines boxes.
+    """
     predicted = [predicted_entity(e.name, e.semantic_class, e.score, e.mesh) for e in entities]
     true = seen.surface()
     found = compare(predicted, true)
-    refined, distance, nodes = _contact_graph(entities, predicted, seen.room, true, found.iou)
+    refined, distance, nodes = predicted, 0, 0
+    if graph:
+        refined, distance, nodes = _contact_graph(entities, predicted, seen.room, true, found.iou)
     off = _off_surface(entities, seen.room)
     return MapScores(
         panoptic=panoptic_counts(found),
@@ -191,17 +214,20 @@ def _contact_graph(
     return refined, errors.total, errors.nodes
 
 
-def _thick(boxes: dict) -> dict[str, tuple[Float64, Float64]]:
+def _thick(boxes: Mapping[str, OrientedBox]) -> dict[str, tuple[Float64, Float64]]:
     """Boxes of sheets, made so thick that those of one wall overlap."""
     return {name: (box.T_map_box, np.maximum(box.extents, 0.3)) for name, box in boxes.items()}
 
 
-def class_means(counts: dict[str, PanopticCount], only: frozenset[str] | None = None) -> tuple[float, float, float] | None:
+def class_means(
+    counts: Mapping[str, PanopticCount], only: frozenset[str] | None = None
+) -> tuple[float, float, float] | None:
     """PQ, SQ, RQ as means over the classes that are true somewhere; None if there is none."""
     chosen = [c for name, c in counts.items() if c.matched + c.missed and (only is None or name in only)]
     if not chosen:
         return None
-    return tuple(float(np.mean([getattr(c, name) for c in chosen])) for name in ("pq", "sq", "rq"))  # pyright: ignore[reportReturnType]
+    pq, sq, rq = np.mean([(c.pq, c.sq, c.rq) for c in chosen], axis=0).tolist()
+    return pq, sq, rq
 
 
 def scene_metrics(mapped: MappedScene) -> Metrics:
@@ -235,7 +261,7 @@ def score_metrics(scores: MapScores) -> Metrics:
         for group, only in groups:
             means = class_means(counts, only)
             for k, name in enumerate(("pq", "sq", "rq")):
-                found = Metric(None, "1", "no class of this kind") if means is None else measured(means[k], "1")
+                found = unmeasured("1", "no class of this kind") if means is None else measured(means[k], "1")
                 metrics[f"{kind}.{group}{name}"] = found
     for kind, table in (("instances", scores.instances), ("boxes", scores.boxes), ("boxes_refined", scores.refined)):
         for suffix, lenient in (("", False), (".lenient", True)):
@@ -248,5 +274,3 @@ def score_metrics(scores: MapScores) -> Metrics:
     metrics["graph.distance_per_node"] = ratio(scores.distance, scores.nodes, "no nodes")
     return metrics
 
-
-__all__ = ["MapScores", "MappedScene", "class_means", "map_scene", "quantile", "scene_metrics", "score_map", "score_metrics"]

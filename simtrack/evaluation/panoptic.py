@@ -295,7 +295,7 @@ def scored_classes(
             continue
         free = [k for k in range(len(names)) if names[k] == entity.semantic_class and k not in taken]
         best = max(free, key=lambda k: iou[number, k], default=None)
-        right = best is not None and iou[number, best] >= least
+        right = best is not None and bool(iou[number, best] >= least)
         if right and best is not None:
             taken.add(best)
             if true.void[best]:

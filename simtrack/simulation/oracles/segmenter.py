@@ -32,32 +32,36 @@ CONFUSED: Mapping[str, tuple[str, ...]] = {
 class SegmenterErrors:
     """Errors at strength 1. They were set once, by what the map without joint fusion reaches, and stay."""
 
-    wrong_class: float = 0.14
+    wrong_class: float = 0.26
     """Share of epochs in which a thing is taken for something else."""
-    missed: float = 0.12
+    missed: float = 0.22
     """... in which it is not found; small ones are missed more often."""
     small: float = 30.0
     """Pixels: a thing that covers the square of it is missed in half of the rest of the images."""
-    flicker: float = 0.1
+    flicker: float = 0.2
     """Share of images in which a thing that was found is not, or is taken for something else."""
-    split: float = 0.12
+    split: float = 0.24
     """Share of epochs in which one thing is seen as two."""
-    merged: float = 0.12
+    merged: float = 0.24
     """... in which a thing and one of the same class or size beside it are seen as one."""
-    leak: float = 0.35
+    leak: float = 0.7
     """... in which a thing's mask reaches far over its border."""
-    leak_size: float = 0.3
+    leak_size: float = 0.6
     """How far it does, as a share of the root of its area."""
-    ragged: float = 5.0
+    filled: float = 0.9
+    """... in which the gaps of a thing, and what is seen through them, are taken for part of it."""
+    filled_size: float = 0.5
+    """How wide such gaps are, as a share of the root of its area."""
+    ragged: float = 9.0
     """Pixels of 640: standard deviation of the borders."""
     epoch: float = 2.0
     """Seconds that an error lasts."""
 
     def __post_init__(self) -> None:
-        for name in ("wrong_class", "missed", "flicker", "split", "merged", "leak"):
+        for name in ("wrong_class", "missed", "flicker", "split", "merged", "leak", "filled"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"SegmenterErrors.{name}", getattr(self, name), "a share, 0 to 1")
-        for name in ("small", "leak_size", "ragged"):
+        for name in ("small", "leak_size", "filled_size", "ragged"):
             if not 0.0 <= getattr(self, name) < 1e4:
                 raise InvalidValueError(f"SegmenterErrors.{name}", getattr(self, name), "0 or more, finite")
         if not 0.0 < self.epoch < 1e6:
@@ -117,7 +121,7 @@ class OracleSegmenter:
         original = image.copy()
         for number, area in areas.items():
             rng = self._lasting(number, stamp)
-            luck = rng.random(5) / max(s, 1e-9)
+            luck = rng.random(6) / max(s, 1e-9)
             side, wrong, other = rng.uniform(0.0, 2.0 * np.pi), rng.random(), rng.uniform(-0.25, 0.25)
             fleeting, kind = flicker.random() / max(s, 1e-9), flicker.random()
             stuff = names[number] in STUFF
@@ -142,8 +146,10 @@ class OracleSegmenter:
                 beside = self._beside(original, mine, number, names)
                 if beside is not None:
                     image[image == beside] = number
+            if luck[5] < errors.filled and not stuff:
+                _fill(image, mine, number, min(errors.filled_size * s * np.sqrt(area), 40.0 * scale))
             if luck[4] < errors.leak * (0.3 if stuff else 1.0):
-                reach = errors.leak_size * min(s, 2.0) * np.sqrt(area) * (0.5 + wrong)
+                reach = errors.leak_size * s * np.sqrt(area) * (0.5 + wrong)
                 _leak(image, mine, number, side, min(reach, 90.0 * scale))
         return _warped(image, s * errors.ragged * scale, flicker, self._lasting(-1, stamp)), names
 
@@ -177,12 +183,23 @@ def _leak(image: Int32, mask: np.ndarray, number: int, side: float, reach: float
     """Let a segment take what is beside it on one side, in place."""
     import cv2
 
-    radius = round(reach)
-    if radius < 1:
+    if reach < 1.0:
         return
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    taken = cv2.dilate(mask.astype(np.uint8), disc).astype(bool) & _half(mask, side, 0.15)
-    image[taken & ~mask] = number
+    near = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3) <= reach
+    image[near & ~mask & _half(mask, side, 0.15)] = number
+
+
+def _fill(image: Int32, mask: np.ndarray, number: int, width: float) -> None:
+    """Let a segment take what is seen through its gaps, in place."""
+    import cv2
+
+    if width < 2.0:
+        return
+    # Grown by half the width, then shrunk by as much.
+    near = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3) <= 0.5 * width
+    framed = np.pad(near, 1, mode="edge").astype(np.uint8)
+    closed = cv2.distanceTransform(framed, cv2.DIST_L2, 3)[1:-1, 1:-1] > 0.5 * width
+    image[closed & ~mask] = number
 
 
 def _warped(image: Int32, sigma: float, flicker: np.random.Generator, lasting: np.random.Generator) -> Int32:

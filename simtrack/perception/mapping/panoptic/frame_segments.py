@@ -100,7 +100,7 @@ def fuse_segments(
     segments = FrameSegments(image, instances[kept], sizes[kept])
     if config.cluster and masks:
         things = [k + 1 for k, name in enumerate(panoptic.classes) if name not in stuff]
-        _keep_largest_clusters(segments, things, depth, intrinsics, config.distance)
+        _keep_largest_clusters(segments, panoptic.image, things, depth, intrinsics, config.distance)
     return segments
 
 
@@ -117,17 +117,23 @@ def _extracted(joint: np.ndarray, least: int, config: FrameFusionConfig) -> np.n
 
 
 def _keep_largest_clusters(
-    segments: FrameSegments, things: Sequence[int], depth: Float32, intrinsics: CameraIntrinsics, distance: float
-) -> None:
-    """Send the segments of a thing that are not in its largest cluster to the background, in place."""
+    segments: FrameSegments, masks: Int32, things: Sequence[int], depth: Float32, intrinsics: CameraIntrinsics,
+    distance: float,
+) -> None:  # fmt: skip
+    """Send the segments of a thing that are not in its largest cluster to the background, in place.
+
+    Readings of its mask that are in no segment, as those on edges, hold segments together too.
+    """
     stride = max(1, intrinsics.width // 160)
-    sparse = segments.image[::stride, ::stride]
+    sparse, mask = segments.image[::stride, ::stride], masks[::stride, ::stride]
+    free = (sparse == 0) & (depth[::stride, ::stride] > 0.0)
     for thing in things:
         members = np.flatnonzero(segments.instances == thing)
         if len(members) < 2:
             continue
         points = [_points(sparse == number, depth, intrinsics, stride) for number in members.tolist()]
-        cluster = _clusters(points, distance)
+        loose = _points(free & (mask == thing), depth, intrinsics, stride)
+        cluster = _clusters([*points, *loose[:, None]], distance)[: len(members)]
         weight = np.bincount(cluster, segments.sizes[members])
         segments.instances[members[cluster != weight.argmax()]] = 0
 

@@ -100,7 +100,11 @@ class PanopticMap:
         """Reason -> frames that were not."""
 
     def integrate(
-        self, frame: RgbdFrame, T_map_camera: Float64 | None, panoptic: PanopticSegments | None
+        self,
+        frame: RgbdFrame,
+        T_map_camera: Float64 | None,
+        panoptic: PanopticSegments | None,
+        geometric: Int32 | None = None,
     ) -> MapUpdate:
         """Fuse one frame.
 
@@ -110,6 +114,7 @@ class PanopticMap:
             frame: depth is needed, colour is not.
             T_map_camera: (4, 4); None where it is not known.
             panoptic: segments of the image; None where the segmenter failed.
+            geometric: (H, W) numbers of geometric segments, from 1; None has them made of the depth.
         """
         reason = _unusable(frame, T_map_camera, panoptic)
         if reason or T_map_camera is None or panoptic is None:
@@ -118,7 +123,8 @@ class PanopticMap:
         depth = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
         if not depth.any():
             return self._skip(frame, "no readings", Status.NO_DATA)
-        geometric = depth_segments(depth, frame.intrinsics, self.config.geometric)
+        if geometric is None:
+            geometric = depth_segments(depth, frame.intrinsics, self.config.geometric)
         stuff = self.config.counts.stuff
         segments = fuse_segments(geometric, panoptic, depth, frame.intrinsics, stuff, self.config.fusion)
         stride = max(1, round(frame.intrinsics.width / 320))
