@@ -7,9 +7,7 @@ from shutil import rmtree
 
 
 @contextmanager
-def new_folder(
-    folder: Path, overwrite: bool, files: Sequence[str] = (), folders: Sequence[str] = ()
-) -> Iterator[Path]:
+def new_folder(folder: Path, overwrite: bool, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Iterator[Path]:
     """A folder to work in, beside the wanted one, which it becomes if all goes well; else nothing is left of it.
 
     Args:

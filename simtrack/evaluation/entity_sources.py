@@ -59,7 +59,9 @@ def source_entities(source: str, choice: EntityChoice | None = None, seed: int =
         return SourceEntities(run.name, run.entities, run.models, run.findings)
     scene = load_scene(source)
     if choice in ("tracked", "mapped"):
-        raise InvalidValueError("entities", choice, f"true or partial: {source} is a scene, and nothing {choice} it yet")
+        raise InvalidValueError(
+            "entities", choice, f"true or partial: {source} is a scene, and nothing {choice} it yet"
+        )
     if scene.static.builder != "room":
         return scene_objects(scene, choice or "true", seed)
     return room_entities(scene, choice or "true", seed)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +66,7 @@ class MapSource:
     segmenter: Segmenter
     room: SettledRoom | None = None
     """The truth, where it is known."""
-    held: AbstractContextManager = nullcontext()
+    held: AbstractContextManager[object] = field(default_factory=nullcontext)
     """What must be released afterwards."""
 
 

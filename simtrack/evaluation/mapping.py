@@ -273,4 +273,3 @@ def score_metrics(scores: MapScores) -> Metrics:
     metrics["surface.completeness"] = measured(scores.completeness, "1")
     metrics["graph.distance_per_node"] = ratio(scores.distance, scores.nodes, "no nodes")
     return metrics
-

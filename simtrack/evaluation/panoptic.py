@@ -6,8 +6,8 @@ Definitions
   belongs to the entity whose surface is nearest within `REACH`, or to none; predicted surface farther than that from
   any true one counts as points of its entity that are wrong.
 * PQ, SQ, RQ (Kirillov et al., CVPR 2019; Eq. 15 of the reconstruction paper): entities of equal class match at an IoU
-  above 0.5. Stuff is one entity a class. A true thing of which less than `LEAST_SEEN` was seen is void: not missed if it
-  is not found, and what lies mostly on it is not wrong.
+  above 0.5. Stuff is one entity a class. A true thing of which less than `LEAST_SEEN` was seen is void: it is not missed
+  where it is not found, and what lies mostly on it is not wrong.
 * AP: area under the precision-recall curve with its envelope; classes that are there and never predicted have 0.
 * The lenient definition, which is the one of the paper's code: labels are carried to the nearest predicted point
   however far, so unseen surface counts for nothing; AP at 11 recalls, where the last precision counts for all recalls
@@ -128,7 +128,9 @@ def _spread(mesh: Mesh, number: int, rng: np.random.Generator) -> Float64:
 
 def predicted_entity(name: str, semantic_class: str, score: float, mesh: Mesh) -> PanopticEntity:
     """An entity of a map as it is compared: its points one a cell."""
-    return PanopticEntity(name, semantic_class, score, _spread(mesh, 0, np.random.default_rng(0)), upright_box(mesh.vertices))
+    return PanopticEntity(
+        name, semantic_class, score, _spread(mesh, 0, np.random.default_rng(0)), upright_box(mesh.vertices)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

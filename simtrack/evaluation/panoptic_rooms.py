@@ -45,7 +45,9 @@ class RoomMapTask:
     def file(self) -> str:
         """Name of the file that its outcome is kept in."""
         methods = "-".join(self.methods)
-        return f"{self.room.replace(':', '-')}-{self.strength:g}-{self.frames}-{self.voxel:g}-{self.sensor}-{methods}.json"
+        return (
+            f"{self.room.replace(':', '-')}-{self.strength:g}-{self.frames}-{self.voxel:g}-{self.sensor}-{methods}.json"
+        )
 
     def run(self, progress: Callable[[int, int], None] | None = None) -> dict[Method, MapScores]:
         """Map and compare; the contact graph is built of the full method's map alone."""
@@ -114,7 +116,9 @@ def scores_from_json(document: Mapping[str, Any]) -> MapScores:
         return {name: PanopticCount(**row) for name, row in rows.items()}
 
     def scored(rows: Mapping[str, Any]) -> dict[str, ScoredClass]:
-        return {n: ScoredClass(tuple((float(s), bool(r)) for s, r in row["hits"]), row["true"]) for n, row in rows.items()}
+        return {
+            n: ScoredClass(tuple((float(s), bool(r)) for s, r in row["hits"]), row["true"]) for n, row in rows.items()
+        }
 
     return MapScores(
         panoptic=panoptic(document["panoptic"]),
@@ -212,7 +216,12 @@ def precision_table(total: Mapping[Method, MapScores], boxes: bool) -> tuple[lis
 def table_5(done: Mapping[RoomMapTask, Results]) -> tuple[list[str], list[list[str]]]:
     """As Table 5: distance of the contact graph of the full method's map, 2 W + M + E."""
     rows = [
-        [task.room, str(r["full"].nodes), str(r["full"].distance), f"{r['full'].distance / max(r['full'].nodes, 1):.2f}"]
+        [
+            task.room,
+            str(r["full"].nodes),
+            str(r["full"].distance),
+            f"{r['full'].distance / max(r['full'].nodes, 1):.2f}",
+        ]
         for task, r in done.items()
         if "full" in r
     ]
@@ -222,7 +231,9 @@ def table_5(done: Mapping[RoomMapTask, Results]) -> tuple[list[str], list[list[s
 def ordering(done: Mapping[RoomMapTask, Results], better: Method, worse: Method) -> tuple[int, int]:
     """Rooms in which one method's PQ (mean over classes) is above another's, of how many."""
     pairs = [
-        (class_means(r[better].panoptic), class_means(r[worse].panoptic)) for r in done.values() if {better, worse} <= r.keys()
+        (class_means(r[better].panoptic), class_means(r[worse].panoptic))
+        for r in done.values()
+        if {better, worse} <= r.keys()
     ]
     return sum(a is not None and b is not None and a[0] > b[0] for a, b in pairs), len(pairs)
 
@@ -244,7 +255,11 @@ def write_panoptic(done: Mapping[RoomMapTask, Results], folder: Path) -> list[st
              f"oracle at strength {first.strength:g}", ""]  # fmt: skip
     for title, (columns, rows) in tables_of(done, total).items():
         wide = [max(len(row[k]) for row in (columns, *rows)) for k in range(len(columns))]
-        lines += [title, *("  ".join(c.rjust(w) for c, w in zip(row, wide, strict=True)) for row in (columns, *rows)), ""]
+        lines += [
+            title,
+            *("  ".join(c.rjust(w) for c, w in zip(row, wide, strict=True)) for row in (columns, *rows)),
+            "",
+        ]
     for better, worse in (("full", "no-joint-fusion"), ("no-joint-fusion", "voxbloxpp"), ("full", "voxbloxpp")):
         more, of = ordering(done, better, worse)
         if of:

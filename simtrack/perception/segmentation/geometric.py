@@ -82,7 +82,7 @@ def depth_segments(depth: Float32, intrinsics: CameraIntrinsics, config: Geometr
         smooth, normals, camera, config.edge_reach, config.convexity, config.mask, config.mask_noise,
         config.discontinuity,
     )  # fmt: skip
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=4, ltype=cv2.CV_32S)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(inside, connectivity=4, ltype=cv2.CV_32S)
     least = config.min_pixels * (intrinsics.width / 640.0) ** 2 / stride**2
     large = stats[:, cv2.CC_STAT_AREA] >= least
     large[0] = False

@@ -137,7 +137,7 @@ class JointCounts:
         classes = {name for counts in self.phi.values() for name, p in counts if p != NOBODY}
         for name in sorted(classes - config.stuff):
             while True:
-                labels, instances, table = self._table(name)
+                instances, table = self._table(name)
                 if len(instances) < 2:
                     break
                 shared = table >= np.maximum(config.common * table.sum(axis=1, keepdims=True), 1.0)
@@ -168,8 +168,8 @@ class JointCounts:
         count, negative = max((count, -p) for (c, p), count in counts.items() if c == name)
         return SegmentEntity(name, -negative, count, sum(counts.values()))
 
-    def _table(self, name: str) -> tuple[list[int], list[int], np.ndarray]:
-        """Segments, instances and (L, P) float64 counts of a class."""
+    def _table(self, name: str) -> tuple[list[int], np.ndarray]:
+        """Instances of a class, and (L, P) float64 their counts on its segments."""
         labels = sorted(label for label, counts in self.phi.items() if any(c == name for c, _ in counts))
         instances = sorted({p for label in labels for c, p in self.phi[label] if c == name})
         column = {p: k for k, p in enumerate(instances)}
@@ -178,7 +178,7 @@ class JointCounts:
             for (c, p), count in self.phi[label].items():
                 if c == name:
                     table[row, column[p]] = count
-        return labels, instances, table
+        return instances, table
 
     def _merge_instances(self, name: str, p: int, into: int) -> None:
         for counts in self.phi.values():

@@ -107,7 +107,7 @@ def extract_entities(
         mesh = _part(surface, order[bounds[k] : bounds[k + 1]])
         if len(mesh.faces) and face_areas(mesh).sum() >= config.least_area:
             running[name] = running.get(name, 0) + 1
-            agreeing, observed = (sum(values) for values in zip(*((e.agreeing, e.observed) for e in parts[name, p])))
+            agreeing, observed = sum(e.agreeing for e in parts[name, p]), sum(e.observed for e in parts[name, p])
             found.append(MapEntityMesh(f"{name}{running[name]}", name, p, agreeing / observed, mesh))
     return tuple(found)
 

@@ -1,7 +1,7 @@
 """A folder of mapped entities: one PLY file an entity, and ``entities.json`` that says what they are.
 
-    entities.json            [{"name", "class", "class_id", "instance", "score", "file"}, ...]
-    entities/NAME.ply        map frame, metres; vertices carry class_id and instance, the header class and name
+entities.json            [{"name", "class", "class_id", "instance", "score", "file"}, ...]
+entities/NAME.ply        map frame, metres; vertices carry class_id and instance, the header class and name
 """
 
 import json
@@ -33,7 +33,13 @@ def write_entities(entities: Sequence[MapEntityMesh], folder: Path) -> list[str]
         comments = (f"class {entity.semantic_class}", f"name {entity.name}")
         write_ply(folder / file, entity.mesh, labels=labels, comments=comments)
         rows.append(
-            {"name": entity.name, "class": entity.semantic_class, **labels, "score": round(entity.score, 6), "file": file}
+            {
+                "name": entity.name,
+                "class": entity.semantic_class,
+                **labels,
+                "score": round(entity.score, 6),
+                "file": file,
+            }
         )
     (folder / LISTING).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return [LISTING, *(str(row["file"]) for row in rows)]

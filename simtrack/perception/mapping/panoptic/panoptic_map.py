@@ -131,7 +131,9 @@ class PanopticMap:
         met, counts = self.volume.overlaps(
             depth, segments.image, frame.intrinsics, T_map_camera, self.labels.canonical, stride
         )
-        least = max(1, round(self.config.association.least_readings * (frame.intrinsics.width / 640.0 * 2 / stride) ** 2))
+        least = max(
+            1, round(self.config.association.least_readings * (frame.intrinsics.width / 640.0 * 2 / stride) ** 2)
+        )
         labels = self.labels.associate(met, counts, least)
         image = labels[segments.image]
         try:

@@ -132,7 +132,9 @@ class Volume:
             kernels.integrate(listed, *arguments)
         else:  # blocks are independent of each other
             with ThreadPoolExecutor(threads) as pool:
-                for done in [pool.submit(kernels.integrate, part, *arguments) for part in np.array_split(listed, threads)]:
+                for done in [
+                    pool.submit(kernels.integrate, part, *arguments) for part in np.array_split(listed, threads)
+                ]:
                     done.result()
         return len(listed)
 

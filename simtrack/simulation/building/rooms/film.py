@@ -114,8 +114,7 @@ class RoomFilm:
         rgb = _shaded(rows, self._colors, hits.normals, hits.distances, rays, T[:3, 3].astype(np.float32), light)
         rng = np.random.default_rng([self.seed, self.room.plan.seed, number])
         if self.config.noise:
-            R = T[:3, :3].astype(np.float32)
-            normals = (hits.normals @ R).reshape(*shape, 3)
+            normals = (hits.normals @ T[:3, :3].astype(np.float32)).reshape(*shape, 3)
             read = apply_depth_noise(depth, normals, K, self._noise, rng)
         else:
             read = np.where(depth >= self.camera.min_range, depth, np.float32(0.0))
@@ -176,7 +175,7 @@ def _wobble(seconds: Float64, rate: float, size: float, rng: np.random.Generator
 def _free_reach(
     scene: RayScene, middle: Float64, half: Float64, config: FilmConfig, rng: np.random.Generator
 ) -> Float64:
-    """(_ANGLES,) metres from the middle, smooth over the angle, at which a camera has its clearance on the way there."""
+    """(_ANGLES,) metres from the middle up to which a camera has its clearance, smooth over the angle."""
     angles = 2.0 * np.pi * np.arange(_ANGLES) / _ANGLES
     ellipse = half[0] * half[1] / np.hypot(half[1] * np.cos(angles), half[0] * np.sin(angles))
     shares = np.linspace(0.0, rng.uniform(0.5, 0.65), 24)
