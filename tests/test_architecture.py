@@ -29,12 +29,23 @@ ROOMS = (
     "evaluation",
     "envs",
     "report",
+    "testing",
     "benchmarks",
     "cli",
 )
 """From top to bottom: a room imports only from itself and from rooms above it."""
 
-HIDDEN_FROM_PERCEPTION = {"simulation", "recordings", "datasets", "evaluation", "envs", "report", "benchmarks", "cli"}
+HIDDEN_FROM_PERCEPTION = {
+    "simulation",
+    "recordings",
+    "datasets",
+    "evaluation",
+    "envs",
+    "report",
+    "testing",
+    "benchmarks",
+    "cli",
+}
 HEAVY = {"numba", "scipy", "trimesh", "cv2", "mujoco", "skimage", "shapely", "pyoxigraph", "matplotlib", "embreex"}
 HEAVY |= {"pydantic", "manifold3d", "mcap", "rerun", "tyro", "rich", "ray"}
 IMPORT_NAMES = {
@@ -109,6 +120,7 @@ def test_every_package_that_is_imported_is_a_declared_dependency() -> None:
     declared = {re.split(r"[\[<>=~!; ]", line)[0] for line in lines}
     modules = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in declared} | {"simtrack"}
     modules |= {"llvmlite", "markupsafe", "pydantic_core", "pybullet_utils"}  # of numba, jinja2, pydantic, pybullet
+    modules |= {"pytest"}  # whose plugin only pytest itself imports
     modules |= set(sys.stdlib_module_names)
     found = [(path, line, name.split(".")[0]) for path in MODULES for line, name in imported(path)]
     assert [f"{path}:{line}: {top}" for path, line, top in found if top not in modules] == []

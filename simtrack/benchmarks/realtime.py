@@ -2,9 +2,10 @@
 
 The workbench is run once and recorded: RGB-D at 30 Hz, lidar at 10 Hz, odometry, joints, and the oracle's detections
 with their latency. Then the feed is played: a frame arrives when the clock reaches its stamp. Scans and odometry wait
-for the stack; of images that arrived while it was busy only the newest is taken, the others are dropped. Latency runs
-from an image's arrival to the belief about it. Another process unpacks the log ahead, as a robot's drivers are others:
-its work is not the stack's, but takes its share of the machine.
+for the stack; of images that arrived while it was busy only the newest is taken, the others are dropped. The stack
+waits for no work beside the frames (`StackConfig.live`). Latency runs from an image's arrival to the belief about it.
+Another process unpacks the log ahead, as a robot's drivers are others: its work is not the stack's, but takes its share
+of the machine.
 """
 
 import gc
@@ -22,7 +23,7 @@ from simtrack.benchmarks.feed import Feed
 from simtrack.benchmarks.harness import Benchmark, Options
 from simtrack.contracts import NANOSECONDS, LidarScan, RgbdFrame, SensorFrame
 from simtrack.perception.localization.measurement import scan_end
-from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.pipeline import PerceptionStack, StackConfig
 from simtrack.recordings import Recording
 
 SWITCH_INTERVAL = 2e-4
@@ -95,7 +96,7 @@ def play(recording: Recording) -> Play:
     assert recording.static_map is not None and recording.robot is not None
     stack = PerceptionStack(
         recording.static_map, recording.models, recording.robot, RecordedDetector(recording),
-        T_map_base=start_pose(recording.metadata, recording.path),
+        T_map_base=start_pose(recording.metadata, recording.path), config=StackConfig.live(),
     )  # fmt: skip
     interval = sys.getswitchinterval()
     try:

@@ -6,8 +6,11 @@ from collections.abc import Sequence
 
 import simtrack
 from simtrack.cli import console
+from simtrack.cli.attribute import attribute
 from simtrack.cli.bench import bench
 from simtrack.cli.check import check
+from simtrack.cli.compare import compare
+from simtrack.cli.debug import debug
 from simtrack.cli.env import env
 from simtrack.cli.evaluate import evaluate
 from simtrack.cli.generate import generate
@@ -20,6 +23,7 @@ from simtrack.cli.replay import replay
 from simtrack.cli.run import run
 from simtrack.cli.scenes import scenes
 from simtrack.cli.score import score
+from simtrack.cli.sweep import sweep
 from simtrack.cli.trials import trials
 from simtrack.cli.validate import validate
 
@@ -27,6 +31,10 @@ VERBS = {
     "run": run,
     "replay": replay,
     "score": score,
+    "attribute": attribute,
+    "sweep": sweep,
+    "compare": compare,
+    "debug": debug,
     "env": env,
     "generate": generate,
     "inspect": inspect,

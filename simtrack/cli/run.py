@@ -37,7 +37,7 @@ def run(
         out: Folder for the results; runs/SCENE-SEED if not given.
         agent: What decides where the robot looks and drives: explorer, fixed-gaze, route; the scene's own if not given.
         tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
-        localizer: A localizer of yours, package.module:Class.
+        localizer: A localizer of yours, package.module:Class, or oracle: one that knows the truth.
         detector: What detects objects in images: oracle, or package.module:Class.
         stage_limit: Seconds that a stage of yours has for a frame; after that the frame counts as missed.
         renderer: mujoco needs OpenGL (EGL), embree needs none.

@@ -40,6 +40,32 @@ class ArchivePart:
     data: bytes
 
 
+def connected(workers: int, address: str | None) -> tuple[Any, bool]:
+    """Ray, connected to a cluster, and whether that was started here; arguments and errors are those of `RayPool`."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray  # pyright: ignore[reportMissingImports] - extra `distributed`
+    except ImportError as error:
+        raise InvalidValueError("engine", "ray", "local; or install the extra simtrack[distributed]") from error
+    if ray.is_initialized():
+        return ray, False
+    settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+    if address is None:
+        settings |= {"num_cpus": workers, "include_dashboard": False, "address": "local"}
+    else:
+        settings["address"] = address
+    try:
+        if address is not None and address != "auto":
+            host, _, port = address.rpartition(":")
+            # Ray itself tries for minutes.
+            socket.create_connection((host, int(port)), CONNECT_TIMEOUT).close()
+        ray.init(**settings)
+    except (OSError, ValueError, RuntimeError) as error:
+        allowed = f"auto, or HOST:PORT of a running Ray cluster ({error})"
+        raise InvalidValueError("address", address, allowed) from error
+    return ray, True
+
+
 class RayPool:
     """A fixed number of actors; one that is lost is replaced by a new one, wherever there is room."""
 
@@ -65,16 +91,8 @@ class RayPool:
         Raises:
             InvalidValueError: Ray is not installed, or there is no such cluster.
         """
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        try:
-            import ray  # pyright: ignore[reportMissingImports] - extra `distributed`
-        except ImportError as error:
-            raise InvalidValueError("engine", "ray", "local; or install the extra simtrack[distributed]") from error
-        self._ray: Any = ray
+        self._ray, self._started_here = connected(workers, address)
         self._address = address
-        self._started_here = not ray.is_initialized()
-        if self._started_here:
-            self._connect(workers, address)
         self._probe = staging / PROBE
         if shared:
             self._probe.write_text(staging.name)
@@ -86,22 +104,6 @@ class RayPool:
         """Stream of events of a scene -> its actor, its number, its folder."""
         self._size = workers
         self._environments_agree()
-
-    def _connect(self, workers: int, address: str | None) -> None:
-        settings: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
-        if address is None:
-            settings |= {"num_cpus": workers, "include_dashboard": False, "address": "local"}
-        else:
-            settings["address"] = address
-        try:
-            if address is not None and address != "auto":
-                host, _, port = address.rpartition(":")
-                # Ray itself tries for minutes.
-                socket.create_connection((host, int(port)), CONNECT_TIMEOUT).close()
-            self._ray.init(**settings)
-        except (OSError, ValueError, RuntimeError) as error:
-            allowed = f"auto, or HOST:PORT of a running Ray cluster ({error})"
-            raise InvalidValueError("address", address, allowed) from error
 
     def _environments_agree(self) -> None:
         """Have one worker tell its versions: others make other bytes."""

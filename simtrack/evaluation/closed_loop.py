@@ -31,9 +31,10 @@ from simtrack.contracts import (
 from simtrack.errors import InvalidValueError
 from simtrack.evaluation.evaluator import Evaluator, pose_scorers, true_models
 from simtrack.evaluation.foreign_stages import fault_metrics, foreign_stages, write_faults
+from simtrack.evaluation.instrument.moments import MomentKeeper
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
 from simtrack.evaluation.record import RelationTimeline, RunRecord, graph_name
-from simtrack.evaluation.run_config import FIXED_GAZE, RunConfig
+from simtrack.evaluation.run_config import FIXED_GAZE, ORACLE, RunConfig
 from simtrack.evaluation.run_folder import EstimateTables, RunFolder, TruthTables
 from simtrack.evaluation.start_up import warm_up
 from simtrack.evaluation.tracking import TrackingEvaluator
@@ -41,8 +42,9 @@ from simtrack.geometry.kinematics import KinematicTree
 from simtrack.objects import ObjectModel
 from simtrack.perception.foreign import StageContext, Watch
 from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.tracking.tracker import ObjectTracker
 from simtrack.simulation.agents import AgentContext, make_agent
-from simtrack.simulation.oracles import OracleDetector
+from simtrack.simulation.oracles import OracleDetector, OracleLocalizer
 from simtrack.simulation.randomness import stream
 from simtrack.simulation.simulation import Simulation
 
@@ -147,6 +149,10 @@ class Loop:
     """Held until the agent gives the first one."""
     watches: Sequence[Watch] = ()
     """Of the stages that are not simtrack's."""
+    script: Sequence[Command] | None = None
+    """Given instead of the agent's commands, one a camera period; the last one is held."""
+    given: list[Command] = field(default_factory=list)
+    """The commands so far, one a camera period."""
 
     def drive(
         self, seconds: float, clock: Clock, log: "McapWriter | None" = None
@@ -159,6 +165,9 @@ class Loop:
         simulation, period = self.simulation, self.simulation.camera_period
         while simulation.now + period <= round(seconds * NANOSECONDS):
             want_rgb = self.stack.wants_image(simulation.now + period)
+            if self.script:
+                command = self.script[min(len(self.given), len(self.script) - 1)]
+            self.given.append(command)
             with clock("simulation"):
                 frames = simulation.advance(command, want_rgb=want_rgb)
             for frame in frames:
@@ -196,14 +205,14 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
             simulation.static_map,
             simulation.models,
             simulation.robot,
-            foreign.detector or OracleDetector(simulation.truth, simulation.models, config.seed),
+            foreign.detector or OracleDetector(simulation.truth, simulation.models, config.seed, config.oracle),
             T_map_base=simulation.start,
             config=config.stack,
-            localizer=foreign.localizer,
+            localizer=OracleLocalizer(simulation.truth) if config.localizer == ORACLE else foreign.localizer,
             tracker=foreign.tracker,
         )
         exits.callback(stack.close)
-        yield Loop(simulation, stack, make_agent(agent, context), start, foreign.watches)
+        yield Loop(simulation, stack, make_agent(agent, context), start, foreign.watches, config.script)
 
 
 @dataclass(slots=True)
@@ -220,10 +229,13 @@ class ClosedLoopRun:
     _clock: Clock = field(default_factory=Clock)
     _stages: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     _timeline: RelationTimeline = field(default_factory=RelationTimeline)
+    _moments: MomentKeeper = field(default_factory=MomentKeeper)
     _images: int = 0
     _steady_from: tuple[int, float, float] | None = None
     """Images, seconds of the loop and of the evaluation at the end of the warm-up."""
     _partial: bool = True
+    commands: Sequence[Command] = ()
+    """What was commanded, one entry a camera period; after `run`."""
     _gain: Metric = field(default_factory=lambda: unmeasured("1", "the fixed gaze was not run for comparison"))
 
     def run(self) -> RunRecord:
@@ -256,13 +268,17 @@ class ClosedLoopRun:
                     objects = evaluator.observe(frame, belief)
                     if belief is not None and evaluator.advanced:
                         estimates.add(belief)
-                        truths.add(len(evaluator.trajectory.stamps) - 1, belief, evaluator.trajectory.true[-1], objects)
+                        image, tracker = len(evaluator.trajectory.stamps) - 1, loop.stack.tracker
+                        truths.add(image, belief, evaluator.trajectory.true[-1], objects)
+                        if isinstance(tracker, ObjectTracker):
+                            self._moments.see(image, tracker.trace, objects)
                         self._remember(belief)
             if config.compare_gaze and not stop.asked:
                 self._compare(evaluator, stop)
-            self._partial = stop.asked
+            self._partial, self.commands = stop.asked, tuple(loop.given)
             record = self._record(loop, evaluator)
             folder.write_metrics(record.metrics)
+            self._moments.save(folder.path)
             if loop.watches:
                 write_faults(folder.path / "faults.csv", [fault for watch in loop.watches for fault in watch.faults])
             folder.write_graph(loop.stack.graph.to_json())
@@ -287,6 +303,7 @@ class ClosedLoopRun:
                 saved = loop.simulation.now
                 folder.write_metrics(self._metrics(evaluator, loop.watches))
                 folder.write_graph(loop.stack.graph.to_json())
+                self._moments.save(folder.path)
             if stop.asked:
                 return
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from simtrack.contracts import NANOSECONDS, Belief, LidarScan, RgbdFrame, SensorFrame
 from simtrack.evaluation.bop_recall import BopRecall
+from simtrack.evaluation.bounds import BoundEvaluator
 from simtrack.evaluation.consistency import ConsistencyEvaluator
 from simtrack.evaluation.floor import FloorEvaluator, RegistrationFromTruth
 from simtrack.evaluation.identity import IdentityEvaluator
@@ -85,6 +86,7 @@ class Evaluator:
         self.consistency = ConsistencyEvaluator({name: model.symmetries for name, model in models.items()})
         self._register = RegistrationFromTruth(simulation.models, config.tracker.registration)
         self.floor = FloorEvaluator(self._register, self._scorers)
+        self.bounds = BoundEvaluator(models, simulation.depth_noise)
         self.relations = RelationEvaluator(models, config.scene_graph.relations)
         catalogue = {
             name: (model.mesh.vertices, model.mesh.faces)
@@ -125,6 +127,7 @@ class Evaluator:
         if self._due("objects", belief.stamp):
             self.relations.observe(belief.relations, objects, truth)
             self.floor.observe(frame, objects)
+            self.bounds.observe(frame, objects)
         if self._due("bop", belief.stamp):
             self.bop.observe(frame, objects)
             self._next["bop"] += PERIOD
@@ -179,8 +182,8 @@ class Evaluator:
     def metrics(self) -> Metrics:
         """All that was measured so far, speed apart."""
         parts = (
-            self.trajectory, self.tracking, self.identity, self.consistency, self.bop, self.floor, self.relations,
-            self.found, *self.presegmentation.values(),
+            self.trajectory, self.tracking, self.identity, self.consistency, self.bop, self.floor, self.bounds,
+            self.relations, self.found, *self.presegmentation.values(),
         )  # fmt: skip
         return {name: metric for part in parts for name, metric in part.metrics().items()}
 
@@ -189,6 +192,7 @@ class Evaluator:
         self._register.close()
         self._surfaces.close()
         self.bop.close()
+        self.bounds.close()
 
     def __enter__(self) -> "Evaluator":
         return self

@@ -54,7 +54,7 @@ def foreign_stages(config: RunConfig, context: StageContext) -> Iterator[Foreign
             built = cast(Tracker, build_stage("tracker", config.tracker, context))
             tracker = GuardedTracker(built, context.models, limit)
             exits.callback(tracker.close)
-        if config.localizer is not None:
+        if config.localizer not in (None, ORACLE):
             built = cast(Localizer, build_stage("localizer", config.localizer, context))
             localizer = GuardedLocalizer(built, context.T_map_base, limit)
             exits.callback(localizer.close)

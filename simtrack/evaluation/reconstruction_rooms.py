@@ -3,20 +3,14 @@
 The outcome of a room is kept in a file as soon as it is there; those of other code are made anew.
 """
 
-import hashlib
 import json
-import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-import simtrack
-from simtrack.datasets.local import follow_parent
-from simtrack.errors import InvalidValueError, SimtrackError
+from simtrack.errors import InvalidValueError
 from simtrack.evaluation.metrics import Metrics, write_atomically
 from simtrack.evaluation.reconstruction import (
     ENTITIES,
@@ -27,6 +21,7 @@ from simtrack.evaluation.reconstruction import (
     outcome_to_json,
     summary,
 )
+from simtrack.evaluation.workers import as_done, code_digest
 
 Stages: TypeAlias = Literal["graph", "models", "physics"]
 MOST_ROOMS = 10_000
@@ -90,14 +85,6 @@ def parse_rooms(text: str) -> list[tuple[int, bool]]:
     return list(dict.fromkeys(rooms))
 
 
-def code_digest() -> str:
-    """Hash of the package's code: results of other code are not carried on."""
-    sha = hashlib.sha256()
-    for source in sorted(Path(simtrack.__file__).parent.rglob("*.py")):
-        sha.update(source.read_bytes())
-    return sha.hexdigest()[:16]
-
-
 def evaluate_rooms(
     tasks: Sequence[RoomTask],
     folder: Path,
@@ -129,7 +116,7 @@ def evaluate_rooms(
                 outcomes[task] = outcome_from_json(document["outcome"])
     say = report or (lambda done, of, what: None)
     say(len(outcomes), len(tasks), f"{len(outcomes)} rooms were done before" if outcomes else "starting")
-    for task, result in _results([task for task in tasks if task not in outcomes], workers):
+    for task, result in as_done([task for task in tasks if task not in outcomes], RoomTask.run, workers):
         if isinstance(result, RoomOutcome):
             outcomes[task] = result
             document = {"code": code, "outcome": outcome_to_json(result)}
@@ -140,29 +127,6 @@ def evaluate_rooms(
             what = f"failed: {result}"
         say(len(outcomes) + len(failed), len(tasks), f"{task.room} ({task.entities}): {what}")
     return Outcomes(tuple(outcomes[task] for task in tasks if task in outcomes), tuple(failed))
-
-
-def _results(tasks: Sequence[RoomTask], workers: int) -> Iterator[tuple[RoomTask, RoomOutcome | BaseException]]:
-    """Tasks with what came of them, as they end; workers are ended at once when the caller stops."""
-    if not tasks:
-        return
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), follow_parent)
-    try:
-        running: dict[Future[RoomOutcome], RoomTask] = {pool.submit(task.run): task for task in tasks}
-        while running:
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                task = running.pop(future)
-                error = future.exception()
-                if error is None:
-                    yield task, future.result()
-                elif isinstance(error, (SimtrackError, BrokenProcessPool)):
-                    yield task, error
-                else:
-                    raise error
-    finally:
-        for process in multiprocessing.active_children():
-            process.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def table_5(outcomes: Sequence[RoomOutcome]) -> tuple[list[str], list[list[str]]]:

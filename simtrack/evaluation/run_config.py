@@ -6,15 +6,17 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import simtrack
+from simtrack.contracts import Command
 from simtrack.errors import InvalidValueError, UnknownNameError
 from simtrack.perception.foreign import check_stage
 from simtrack.perception.foreign.guards import DEFAULT_LIMIT
 from simtrack.perception.pipeline import StackConfig
 from simtrack.simulation.agents import AGENTS
+from simtrack.simulation.oracles import OracleDetectorConfig
 from simtrack.simulation.scene_file import SceneFile
 
 ORACLE = "oracle"
-"""The detector that knows the truth, and errs like a trained network."""
+"""The detector that knows the truth, and errs like a trained network; the localizer that knows it and does not err."""
 RENDERERS = ("mujoco", "embree")
 DEFAULT_AGENT, FIXED_GAZE = "explorer", "fixed-gaze"
 _PACKAGES = ("mujoco", "numpy", "numba", "embreex", "opencv-python-headless", "scipy", "pyoxigraph")
@@ -33,10 +35,12 @@ class RunConfig:
     """The scene's own, or the explorer, if None."""
     detector: str = ORACLE
     """The oracle, or ``package.module:Class``."""
+    oracle: OracleDetectorConfig = field(default_factory=OracleDetectorConfig)
+    """How the oracle detector errs."""
     tracker: str | None = None
     """``package.module:Class`` or ``exec:program``; simtrack's own if None."""
     localizer: str | None = None
-    """``package.module:Class``; simtrack's own if None."""
+    """``package.module:Class``, or the oracle; simtrack's own if None."""
     stage_limit: float = DEFAULT_LIMIT
     """Seconds of the wall clock that a stage of somebody else's has for a frame."""
     renderer: str = "mujoco"
@@ -48,6 +52,8 @@ class RunConfig:
     threads: int | None = None
     """Threads of the compiled kernels; all that there are if None."""
     stack: StackConfig = field(default_factory=StackConfig)
+    script: tuple[Command, ...] | None = None
+    """Commands, one a camera period, that are given instead of the agent's: those of another run, to repeat its way."""
 
     def __post_init__(self) -> None:
         if self.duration is not None and not 0.0 < self.duration <= 3600.0:
@@ -93,6 +99,7 @@ class RunConfig:
             "detector": self.detector,
             "tracker": self.tracker,
             "localizer": self.localizer,
+            "oracle": plain(asdict(self.oracle)),
             "stage_limit": self.stage_limit,
             "renderer": self.renderer,
             "threads": self.threads,

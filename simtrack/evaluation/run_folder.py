@@ -3,9 +3,9 @@
 ``config.yaml`` resolved configuration and versions; ``estimates.csv`` and ``tracks.csv`` what the stack believed of the
 robot and of every object; ``trajectory.csv`` true and believed pose of the base; ``poses.csv`` one line an
 object-frame; ``simtrack_<scene>-test.csv`` results in the format of the BOP challenge; ``graph.json`` the scene
-graph; ``map.npz`` the surveyed map, as the stack has it; ``metrics.json``; ``report.html``. Of a run with stages that
-are not simtrack's: ``faults.csv``, the frames that they missed. Of a recording without a robot: ``frames.csv`` how its
-frames compare with ``map.ply``, the map that they make.
+graph; ``map.npz`` the surveyed map, as the stack has it; ``moments/`` the worst frames, for `simtrack debug`;
+``metrics.json``; ``report.html``. Of a run with stages that are not simtrack's: ``faults.csv``, the frames that they
+missed. Of a recording without a robot: ``frames.csv`` how its frames compare with ``map.ply``, the map that they make.
 """
 
 import csv

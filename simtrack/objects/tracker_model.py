@@ -8,7 +8,7 @@ from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError
 from simtrack.geometry import meshes
 from simtrack.geometry.meshes import Mesh
-from simtrack.objects.model import ObjectModel, box_keypoints
+from simtrack.objects.model import ObjectModel, Symmetries, box_keypoints
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +23,8 @@ class TrackerModelConfig:
     """The scale is drawn uniformly within this share of the true one."""
     face_share: float = 0.5
     """Share of the faces that is left after decimation, in (0, 1]."""
+    false_symmetry: bool = False
+    """The model is said to look the same after half a turn about its z axis, which it need not."""
 
     def __post_init__(self) -> None:
         for name, valid, allowed in (
@@ -70,7 +72,17 @@ def tracker_model(model: ObjectModel, config: TrackerModelConfig, rng: np.random
         extents=extents,
         diameter=meshes.diameter(mesh),
         keypoints=box_keypoints(extents),
+        symmetries=_half_turned(model.symmetries) if config.false_symmetry else model.symmetries,
     )
+
+
+def _half_turned(symmetries: Symmetries) -> Symmetries:
+    """Symmetries with half a turn about z among them."""
+    turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    discrete = symmetries.discrete
+    if any(np.allclose(turn, pose) for pose in discrete):
+        return symmetries
+    return replace(symmetries, discrete=np.concatenate([discrete, discrete @ turn]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

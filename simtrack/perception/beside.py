@@ -2,6 +2,9 @@
 
 What is believed never depends on how fast the machine is or on how many threads it has: when an answer is taken up
 follows from the stamps alone. Where the machine is fast enough the answer is there by then, and no frame waits.
+
+A robot that cannot wait hands over ``wait=False``: an answer that is not there when its time is up is taken up by the
+first frame that finds it. Then beliefs do depend on the machine.
 """
 
 import time
@@ -32,10 +35,10 @@ class Beside(Generic[T]):
     Several may share a thread: it does their pieces one after the other, in the order in which they were begun.
     """
 
-    def __init__(self, thread: ThreadPoolExecutor, seconds: float) -> None:
+    def __init__(self, thread: ThreadPoolExecutor, seconds: float, wait: bool = True) -> None:
         if not seconds >= 0.0:
             raise InvalidValueError("seconds", seconds, ">= 0 s")
-        self._thread, self._period = thread, round(seconds * NANOSECONDS)
+        self._thread, self._period, self._wait = thread, round(seconds * NANOSECONDS), wait
         self._work: tuple[int, Future[tuple[T, float]]] | None = None
         self.seconds = 0.0
         """Wall time of the piece that was settled last. Measured, not simulated."""
@@ -51,8 +54,10 @@ class Beside(Generic[T]):
         self._work = stamp, self._thread.submit(_timed, work)
 
     def due(self, stamp: int) -> bool:
-        """Whether there is a piece whose time is up at `stamp`, nanoseconds."""
-        return self._work is not None and stamp - self._work[0] >= self._period
+        """Whether there is a piece whose time is up at `stamp`, nanoseconds, and that is to be settled then."""
+        if self._work is None or stamp - self._work[0] < self._period:
+            return False
+        return self._wait or self._work[1].done()
 
     def settle(self) -> T:
         """End the piece and give its answer; waits for it if need be. Raises what the work raised."""
@@ -73,15 +78,22 @@ class Paced(Generic[T]):
     For work whose length is not known before: it is settled when its own steps say so, on any machine.
     """
 
-    def __init__(self, thread: ThreadPoolExecutor, seconds: float, work: Callable[[Callable[[], None]], T]) -> None:
+    def __init__(
+        self,
+        thread: ThreadPoolExecutor,
+        seconds: float,
+        work: Callable[[Callable[[], None]], T],
+        wait: bool = True,
+    ) -> None:
         """Begin, or queue behind what the thread has to do.
 
         Args:
             thread: of `worker`.
             seconds: of a step.
             work: gets a function to call before every step.
+            wait: see the module.
         """
-        self._step = round(seconds * NANOSECONDS)
+        self._step, self._wait = round(seconds * NANOSECONDS), wait
         self._steps, self._ended, self._changed = 0, False, Condition()
         self._future = thread.submit(self._run, work)
 
@@ -104,6 +116,8 @@ class Paced(Generic[T]):
         Waits until that is known: until the work ends, or has taken more steps than there is time for.
         """
         with self._changed:
+            if not self._wait and not self._ended:
+                return None
             self._changed.wait_for(lambda: self._ended or start + self._steps * self._step > stamp)
             end = start + self._steps * self._step
         return end if end <= stamp else None

@@ -88,6 +88,13 @@ class StackConfig:
     """A scan's correction of the pose is used this long after the scan's last shot, seconds of the sensor's clock."""
     segmentation_time: float = 0.06
     """What is segmented beside the frames is used this long after it was begun, likewise."""
+    wait: bool = True
+    """Frames wait for what is due and not there yet, so that beliefs are the same on every machine; `live` does not."""
+
+    @staticmethod
+    def live() -> "StackConfig":
+        """For a robot, or a feed at the pace of its clock: a late answer is taken up by the frame that finds it."""
+        return StackConfig(wait=False, tracker=TrackerConfig(wait=False))
 
 
 class PerceptionStack:
@@ -130,10 +137,15 @@ class PerceptionStack:
         self._body = SelfFilter(robot)
         c = self.config
         self._presegmenter = Presegmenter(
-            self._believed.twin(), SelfFilter(robot), c.presegmentation, c.segmentation_time, c.segmentation_time
+            self._believed.twin(),
+            SelfFilter(robot),
+            c.presegmentation,
+            c.segmentation_time,
+            c.segmentation_time,
+            c.wait,
         )
         self._correction_thread = worker("localization")
-        self._correction = Beside[Localization](self._correction_thread, c.correction_time)
+        self._correction = Beside[Localization](self._correction_thread, c.correction_time, c.wait)
         self.localizer = localizer or self._mesh_localizer(static_map, T_map_base)
         self.tracker = tracker or ObjectTracker(models, self.config.tracker)
         self.articulation = (

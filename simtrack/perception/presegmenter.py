@@ -27,6 +27,7 @@ class Presegmenter:
         config: PresegmentationConfig,
         image_time: float,
         scan_time: float,
+        wait: bool = True,
     ) -> None:
         """Start idle.
 
@@ -36,11 +37,12 @@ class Presegmenter:
             config: settings.
             image_time: an image's answer is taken up so many seconds of the sensor's clock after it was begun.
             scan_time: likewise.
+            wait: see `simtrack.perception.beside`.
         """
         self._believed, self._body, self._config = believed, body, config
         self._thread = worker("presegmentation")
-        self.image = Beside[Presegmentation](self._thread, image_time)
-        self.scan = Beside[Presegmentation](self._thread, scan_time)
+        self.image = Beside[Presegmentation](self._thread, image_time, wait)
+        self.scan = Beside[Presegmentation](self._thread, scan_time, wait)
 
     def begin_image(
         self,

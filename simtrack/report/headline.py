@@ -39,7 +39,7 @@ def table(metrics: Mapping[str, Metric], names: Sequence[str], targets: Mapping[
         met = target.met(metric) if target else None
         floor = metrics.get(FLOORS.get(name, ""))
         asked = (
-            f"{target.sign.replace('<=', '≤').replace('>=', '≥')} {_number(target.limit, metric.unit)}"
+            f"{target.sign.replace('<=', '≤').replace('>=', '≥')} {format_value(target.limit, metric.unit)}"
             if target
             else ""
         )
@@ -52,10 +52,11 @@ def table(metrics: Mapping[str, Metric], names: Sequence[str], targets: Mapping[
 
 def format_metric(metric: Metric) -> str:
     """A value as a person reads it: millimetres, degrees, percent."""
-    return "not measured" if metric.value is None else _number(metric.value, metric.unit)
+    return "not measured" if metric.value is None else format_value(metric.value, metric.unit)
 
 
-def _number(value: float, unit: str) -> str:
+def format_value(value: float, unit: str) -> str:
+    """A number of a unit as a person reads it."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     match unit:

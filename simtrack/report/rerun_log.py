@@ -20,6 +20,7 @@ from simtrack.report.colors import class_colors
 if TYPE_CHECKING:
     from rerun import Mesh3D, RecordingStream
 
+    from simtrack.evaluation.instrument.examination import Examination
     from simtrack.objects import ObjectModel
 
 MAP_COLOR, ROBOT_COLOR = (150, 158, 168), (70, 130, 200)
@@ -154,3 +155,36 @@ class RerunLog:
         """Write out what is still on its way."""
         self._stream.flush()
         self._stream.disconnect()
+
+
+def log_examination(found: "Examination", models: "Mapping[str, ObjectModel]", path: Path) -> None:
+    """Write one frame done again for rerun: measured points with their residuals, models at all poses, camera frame.
+
+    Raises:
+        SimtrackError: rerun is not installed.
+        InvalidValueError: the file cannot be written.
+    """
+    log = RerunLog(path=path)
+    rr, stream, moment = log._rr, log._stream, found.moment
+    K = moment.intrinsics
+    v, u = np.nonzero(moment.depth > 0.0)
+    z = moment.depth[v, u]
+    points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=1)
+    off = np.nan_to_num(np.clip(found.residuals[v, u] / 0.01, -1.0, 1.0))
+    paint = np.stack([255 * (1 - np.maximum(off, 0)), 255 * (1 - np.abs(off)), 255 * (1 + np.minimum(off, 0))], axis=1)
+    stream.log("camera", rr.ViewCoordinates.RDF, static=True)
+    stream.log("camera/measured", rr.Points3D(points, colors=paint.astype(np.uint8), radii=0.001), static=True)
+    shown = [("true", (35, 197, 82), o.class_name, o.name, o.T_camera_object) for o in moment.objects]
+    shown += [("predicted", (154, 164, 178), moment.classes[k], str(k), T) for k, T in moment.predicted.items()]
+    shown += [
+        ("registered", (255, 159, 28), o.true.class_name, str(o.true.track), o.result.T_camera_object)
+        for o in found.objects
+        if o.result is not None
+    ]
+    shown += [("detected", (224, 86, 122), name, str(k), T) for k, (name, _, T) in enumerate(moment.hypotheses)]
+    for kind, color, class_name, name, T in shown:
+        if class_name in models:
+            visual = models[class_name].visual
+            stream.log(f"camera/{kind}/{class_name}-{name}", log._mesh(apply(T, visual.vertices), visual.faces, color),
+                       static=True)  # fmt: skip
+    log.close()

@@ -50,6 +50,8 @@ class CalibrationFaults:
     """Seconds added to the stamps of camera frames."""
     lidar_time_offset: float = 0.0
     """Seconds added to the stamps of scans."""
+    lidar_mirrored: bool = False
+    """Scans name their lasers from the top instead of from the bottom: what is above the horizon is reported below."""
     encoder_bias: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     """Joint name -> constant error of its encoder, rad or m."""
 
@@ -82,11 +84,19 @@ class CalibrationFaults:
             return replace(frame, stamp=stamp, T_base_camera=self.believed_camera(frame.T_base_camera))
         if isinstance(frame, LidarScan):
             stamp = frame.stamp + round(1e9 * self.lidar_time_offset)
-            return replace(frame, stamp=stamp, T_base_lidar=self.believed_lidar(frame.T_base_lidar))
+            frame = replace(frame, stamp=stamp, T_base_lidar=self.believed_lidar(frame.T_base_lidar))
+            return _mirrored(frame) if self.lidar_mirrored else frame
         if isinstance(frame, JointState):
             bias = np.array([self.encoder_bias.get(name, 0.0) for name in frame.names])
             return replace(frame, positions=frame.positions + bias)
         return frame
+
+
+def _mirrored(scan: LidarScan) -> LidarScan:
+    """A scan whose lasers are taken for each other, by elevation."""
+    directions = scan.directions * np.array([1.0, 1.0, -1.0], np.float32)
+    rings = scan.rings.max(initial=0) - scan.rings
+    return replace(scan, directions=directions, rings=rings.astype(np.uint8))
 
 
 class FaultyFeed:

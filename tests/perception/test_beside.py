@@ -200,3 +200,32 @@ def test_a_piece_that_fails_ends() -> None:
     with pytest.raises(ValueError, match="no data"):
         piece.settle()
     thread.shutdown()
+
+
+def test_who_does_not_wait_takes_an_answer_up_when_it_is_there() -> None:
+    thread, gate = worker("test"), threading.Event()
+    patient, hasty = Beside[str](thread, 0.1), Beside[str](thread, 0.1, wait=False)
+    hasty.begin(0, lambda: str(gate.wait(10.0)))
+    patient.begin(0, lambda: "late")
+    assert not hasty.due(NANOSECONDS) and patient.due(NANOSECONDS) and not patient.due(NANOSECONDS // 20)
+    gate.set()
+    assert patient.settle() == "late"  # the same thread has ended the other one before
+    assert not hasty.due(NANOSECONDS // 20) and hasty.due(NANOSECONDS // 10) and hasty.settle() == "True"
+    thread.shutdown()
+
+
+def test_paced_work_of_who_does_not_wait_has_no_end_before_it_has_ended() -> None:
+    thread, gate = worker("test"), threading.Event()
+
+    def work(step: Callable[[], None]) -> int:
+        step()
+        gate.wait(10.0)
+        step()
+        return 7
+
+    paced = Paced[int](thread, 0.01, work, wait=False)
+    assert paced.end(0, NANOSECONDS) is None
+    gate.set()
+    assert paced.settle() == 7
+    thread.shutdown()
+    assert paced.end(0, NANOSECONDS) == NANOSECONDS // 50 and paced.end(0, NANOSECONDS // 100) is None

@@ -71,7 +71,7 @@ class ClaimQueue:
         self._waiting.append(claim)
 
     def settle(self, stamp: int) -> tuple[Claim, Candidate | None] | None:
-        """The first claim at work and what was found, once its time is up at `stamp`; waits if need be."""
+        """The first claim at work and what was found, once its time is up at `stamp`; waits if need be, and may."""
         if not self._working:
             return None
         claim, begun, work = self._working[0]
@@ -95,7 +95,7 @@ class ClaimQueue:
             if claim.view.stamp < oldest or (claim.target is not None and not claim.target.alive):
                 continue
             work = Paced[Candidate | None](
-                self._thread, self._config.cast_time, partial(self._candidate, claim, views(claim))
+                self._thread, self._config.cast_time, partial(self._candidate, claim, views(claim)), self._config.wait
             )
             self._working.append((claim, stamp, work))
 

@@ -26,6 +26,8 @@ class TrackerConfig:
     cast_time: float = 0.0005
     """A detection of something new, or that contradicts a track, is registered beside the frames; each of the casts
     that this needs is taken to last so long, seconds of the sensor's clock."""
+    wait: bool = True
+    """Frames wait for such a registration when its time is up; False: see `simtrack.perception.beside`."""
     confirm_detections: int = 2
     """Detections that a new object needs before it is believed; one is enough where the fit leaves no doubt."""
     confirm_frames: int = 3

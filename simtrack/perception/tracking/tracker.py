@@ -47,6 +47,7 @@ from simtrack.perception.tracking.target import (
     share_in_image,
     tracked_model,
 )
+from simtrack.perception.tracking.trace import RegistrationTrace
 
 
 class ObjectTracker:
@@ -69,6 +70,8 @@ class ObjectTracker:
         self._targets: list[Target] = []
         self._next_id = 1
         self._views: deque[View] = deque()
+        self.trace: RegistrationTrace | None = None
+        """The last frame's registration, for those who look for the cause of an error."""
 
     def close(self) -> None:
         """Release the scenes' memory."""
@@ -108,13 +111,13 @@ class ObjectTracker:
         while view.stamp - self._views[0].stamp > self.config.buffer * NANOSECONDS:
             self._views.popleft()
         status = Status.OK if np.any(view.depth) else Status.NO_DATA
-        self._register(view, status)
+        self._register(view, status, hypotheses)
         self._take_detections(hypotheses)
         self._settle_claims(view.stamp)
         self._prune(view.stamp)
         return TrackerResult(frame.stamp, self._tracks(view), status)
 
-    def _register(self, view: View, status: Status) -> None:
+    def _register(self, view: View, status: Status, hypotheses: Sequence[PoseHypothesis]) -> None:
         """Register all living targets to a view and judge each."""
         T_camera_map = inverse(view.T_map_camera)
         living = [t for t in self._targets if t.alive]
@@ -122,6 +125,10 @@ class ObjectTracker:
         results = {}
         if status is not Status.NO_DATA:
             results = self._registration.track(view.depth, view.intrinsics, poses)
+        self.trace = RegistrationTrace(
+            view.stamp, view.depth, view.intrinsics, view.T_map_camera, {t.id: t.model.name for t in living}, poses,
+            results, tuple(hypotheses),
+        )  # fmt: skip
         for target in living:
             self._judge(target, view, poses[target.id], results.get(target.id))
 

@@ -46,6 +46,8 @@ class OracleDetectorConfig:
     """A fully occluded object's keypoint error would be this many times larger, added to 1."""
     reference_distance: float = 1.5
     """Errors grow with distance beyond this, metres."""
+    bias: float = 0.0
+    """All keypoints lie too far to the image's right by this share of the object's image size: a planted fault."""
 
     def __post_init__(self) -> None:
         for name in ("correlation", "miss_rate", "false_positive_rate", "wrong_class_rate", "min_visible"):
@@ -165,7 +167,7 @@ class OracleDetector:
         growth = (1.0 + config.occlusion_growth * (1.0 - visible)) * max(1.0, z / config.reference_distance)
         median = config.keypoint_error * size * growth
         sigma = median / np.sqrt(2.0 * np.log(2.0))  # the median of a 2D normal's norm is sigma sqrt(2 ln 2)
-        pixels = pixels + _keypoint_errors(pixels, sigma, config.correlation, rng)
+        pixels = pixels + _keypoint_errors(pixels, sigma, config.correlation, rng) + (config.bias * size, 0.0)
         name = model.name
         if relabel < config.wrong_class_rate and len(self._models) > 1:
             name = str(rng.choice(sorted(set(self._models) - {name})))

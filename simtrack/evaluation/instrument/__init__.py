@@ -1,0 +1,1 @@
+"""What an end-to-end error comes from: runs under changed conditions, waterfalls, sweeps, comparisons."""
