@@ -60,7 +60,8 @@ def _panoptic(rooms: str, method: str, strength: float, frames: int, voxel: floa
 
     if not 0.0 <= strength <= 3.0:
         raise InvalidValueError("strength", strength, "0 to 3")
-    FilmConfig(frames=frames), VolumeConfig(voxel=voxel)
+    FilmConfig(frames=frames)  # refuse bad values before hours of work
+    VolumeConfig(voxel=voxel)
     methods = tuple(name for name in METHODS if method in (name, "all"))
     tasks = [RoomMapTask(seed, kitchen, methods, strength, frames, voxel) for seed, kitchen in parse_rooms(rooms)]
     with console.ProgressLine("evaluate panoptic", "looking for rooms that are done") as line:

@@ -131,7 +131,7 @@ def map_source(
     if scene.static.builder != "room":
         raise InvalidValueError("source", source, "a furnished room such as rooms:7, or a folder of RGB-D images")
     number = scene.static.seed if scene.static.seed is not None else seed
-    kind = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
+    kind: RoomKind | None = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
     made = room_source(number, kind, film, strength, seed, f"{scene.name}-{number}")
     if segmenter == "none":
         return MapSource(made.name, made.count, made.frames, NoSegmenter(), made.room, made.held)

@@ -6,8 +6,8 @@ Definitions
   belongs to the entity whose surface is nearest within `REACH`, or to none; predicted surface farther than that from
   any true one counts as points of its entity that are wrong.
 * PQ, SQ, RQ (Kirillov et al., CVPR 2019; Eq. 15 of the reconstruction paper): entities of equal class match at an IoU
-  above 0.5. Stuff is one entity a class. A true thing of which less than `LEAST_SEEN` was seen is void: it is not missed
-  where it is not found, and what lies mostly on it is not wrong.
+  above 0.5. Stuff is one entity a class. A true thing of which less than `LEAST_SEEN` was seen is void: not missed
+  if it is not found, and what lies mostly on it is not wrong.
 * AP: area under the precision-recall curve with its envelope; classes that are there and never predicted have 0.
 * The lenient definition, which is the one of the paper's code: labels are carried to the nearest predicted point
   however far, so unseen surface counts for nothing; AP at 11 recalls, where the last precision counts for all recalls
@@ -159,7 +159,7 @@ class Comparison:
 
 def compare(predicted: Sequence[PanopticEntity], true: TrueSurface, lenient: bool = False) -> Comparison:
     """Give every true point to a predicted entity, see above; or every predicted point to a true one."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     def joined(entities: Sequence[PanopticEntity]) -> tuple[Float64, np.ndarray]:
         owner = np.repeat(np.arange(len(entities)), [len(e.points) for e in entities])
@@ -173,8 +173,8 @@ def compare(predicted: Sequence[PanopticEntity], true: TrueSurface, lenient: boo
         far = np.full(len(surface), np.inf)
         return Comparison(tuple(predicted), true, np.zeros(shape, np.int32), sizes[0], sizes[1].astype(np.int32),
                           np.full(len(points), np.inf), far)  # fmt: skip
-    accuracy, nearest_true = cKDTree(surface).query(points)
-    completeness, nearest = cKDTree(points).query(surface)
+    accuracy, nearest_true = map(np.asarray, KDTree(surface).query(points))
+    completeness, nearest = map(np.asarray, KDTree(points).query(surface))
     if lenient:
         pairs = of_point * shape[1] + of_surface[nearest_true]
         sizes = np.bincount(of_point, minlength=shape[0])

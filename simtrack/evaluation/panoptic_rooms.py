@@ -17,11 +17,12 @@ from simtrack.evaluation.map_sources import room_source
 from simtrack.evaluation.mapping import MapScores, class_means, map_scenes, score_map, score_metrics
 from simtrack.evaluation.metrics import write_atomically
 from simtrack.evaluation.panoptic import PAPER_CLASSES, STUFF, PanopticCount, ScoredClass, mean_precision
-from simtrack.evaluation.reconstruction_rooms import code_digest
+from simtrack.evaluation.workers import code_digest
 from simtrack.perception.mapping.panoptic.panoptic_map import Method, PanopticMapConfig
 from simtrack.simulation.building.rooms.film import FilmConfig
 
-Results = Mapping[Method, MapScores]
+Results = Mapping[str, MapScores]
+"""Method -> scores."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +50,7 @@ class RoomMapTask:
             f"{self.room.replace(':', '-')}-{self.strength:g}-{self.frames}-{self.voxel:g}-{self.sensor}-{methods}.json"
         )
 
-    def run(self, progress: Callable[[int, int], None] | None = None) -> dict[Method, MapScores]:
+    def run(self, progress: Callable[[int, int], None] | None = None) -> dict[str, MapScores]:
         """Map and compare; the contact graph is built of the full method's map alone."""
         film = FilmConfig(frames=self.frames, sensor=self.sensor)
         source = room_source(self.seed, "kitchen" if self.kitchen else None, film, self.strength)
@@ -181,7 +182,7 @@ def table_1(done: Mapping[RoomMapTask, Results]) -> tuple[list[str], list[list[s
     return columns, rows
 
 
-def table_2(total: Mapping[Method, MapScores]) -> tuple[list[str], list[list[str]]]:
+def table_2(total: Mapping[str, MapScores]) -> tuple[list[str], list[list[str]]]:
     """As Table 2: PQ, SQ, RQ by class over all rooms; all, stuff and things are means over classes."""
     present = sorted({n for s in total.values() for n, c in s.panoptic.items() if c.matched + c.missed})
     classes = [n for n in PAPER_CLASSES if n in present] + [n for n in present if n not in PAPER_CLASSES]
@@ -199,7 +200,7 @@ def table_2(total: Mapping[Method, MapScores]) -> tuple[list[str], list[list[str
     return ["method", "", *groups, *classes], rows
 
 
-def precision_table(total: Mapping[Method, MapScores], boxes: bool) -> tuple[list[str], list[list[str]]]:
+def precision_table(total: Mapping[str, MapScores], boxes: bool) -> tuple[list[str], list[list[str]]]:
     """As Tables 3 and 4: average precision at an IoU of 0.5 by class, of instances or of upright boxes."""
     tables = {m: (s.boxes if boxes else s.instances) for m, s in total.items()}
     named = {str(m): t for m, t in tables.items()}
@@ -228,7 +229,7 @@ def table_5(done: Mapping[RoomMapTask, Results]) -> tuple[list[str], list[list[s
     return ["room", "nodes", "distance", "per node"], rows
 
 
-def ordering(done: Mapping[RoomMapTask, Results], better: Method, worse: Method) -> tuple[int, int]:
+def ordering(done: Mapping[RoomMapTask, Results], better: str, worse: str) -> tuple[int, int]:
     """Rooms in which one method's PQ (mean over classes) is above another's, of how many."""
     pairs = [
         (class_means(r[better].panoptic), class_means(r[worse].panoptic))
@@ -274,7 +275,7 @@ def write_panoptic(done: Mapping[RoomMapTask, Results], folder: Path) -> list[st
 
 
 def tables_of(
-    done: Mapping[RoomMapTask, Results], total: Mapping[Method, MapScores]
+    done: Mapping[RoomMapTask, Results], total: Mapping[str, MapScores]
 ) -> dict[str, tuple[list[str], list[list[str]]]]:
     """Title -> columns and rows of all tables."""
     return {

@@ -42,7 +42,7 @@ def render(mapped: MappedScene, metrics: Metrics) -> str:
     found = [(e.semantic_class, e.mesh) for e in mapped.entities]
     true = [(e.semantic_class, e.mesh) for e in room.entities] if room else []
     whole = extract_surface(mapped.map.volume, mapped.map.config.entities.least_weight)
-    surface = Mesh(whole.vertices, whole.faces, whole.colors[whole.faces[:, 0]])
+    surface = whole.mesh
     extent = surface if len(surface.faces) else None
     pictures = []
     if extent is not None:

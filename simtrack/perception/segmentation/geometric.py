@@ -87,5 +87,5 @@ def depth_segments(depth: Float32, intrinsics: CameraIntrinsics, config: Geometr
     large = stats[:, cv2.CC_STAT_AREA] >= least
     large[0] = False
     numbers = np.where(large, np.cumsum(large), 0).astype(np.int32)
-    kept = kernels.grown(numbers[labels], coarse, config.grow, np.float32(0.02))
+    kept = kernels.grown(numbers[np.asarray(labels, np.int32)], coarse, config.grow, np.float32(0.02))
     return kernels.enlarged(kept, readings, coarse, stride, near)

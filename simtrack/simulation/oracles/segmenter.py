@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtrack.contracts import NANOSECONDS, Float64, Int32, RgbdFrame
+from simtrack.contracts import NANOSECONDS, Int32, RgbdFrame
 from simtrack.errors import InvalidValueError
 from simtrack.perception.segmentation.panoptic import PanopticSegments
 
@@ -175,7 +175,7 @@ def _half(mask: np.ndarray, side: float, offset: float) -> np.ndarray:
     rows, columns = np.nonzero(mask)
     along = np.array([np.cos(side), np.sin(side)])
     spread = np.sqrt(len(rows)) * offset
-    v, u = np.indices(mask.shape, sparse=True)
+    v, u = np.arange(mask.shape[0])[:, None], np.arange(mask.shape[1])
     return (u - columns.mean()) * along[0] + (v - rows.mean()) * along[1] > spread
 
 
@@ -212,13 +212,13 @@ def _warped(image: Int32, sigma: float, flicker: np.random.Generator, lasting: n
     for axis in range(2):
         small = np.sqrt(0.5) * (flicker.standard_normal(cells) + lasting.standard_normal(cells))
         smooth = cv2.resize(small.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
-        grid: Float64 = np.indices(image.shape, sparse=True)[1 - axis]
+        grid = np.arange(width) if axis == 0 else np.arange(height)[:, None]
         maps.append((grid + sigma * smooth).astype(np.float32))
     as_float = image.astype(np.float32)  # exact for so few numbers, and what remap takes
     return cv2.remap(as_float, maps[0], maps[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE).astype(np.int32)
 
 
-def _panoptic(image: Int32, names: Sequence[str], stamp: int) -> PanopticSegments:
+def _panoptic(image: Int32, names: list[str], stamp: int) -> PanopticSegments:
     present = np.unique(image[image >= 0])
     numbers = np.zeros(len(names) + 1, np.int32)
     numbers[present] = np.arange(1, len(present) + 1)

@@ -59,6 +59,11 @@ class Surface:
     labels: Int32
     """(F,), of segments as voxels carry them; 0 = none."""
 
+    @property
+    def mesh(self) -> Mesh:
+        """The surface in the colours of its faces' first corners."""
+        return Mesh(self.vertices.astype(np.float64), self.faces, self.colors[self.faces[:, 0]])
+
 
 def extract_surface(volume: Volume, least_weight: float) -> Surface:
     """The zero set of a volume where it was seen with at least that weight."""
@@ -115,6 +120,6 @@ def extract_entities(
 def _part(surface: Surface, chosen: np.ndarray) -> Mesh:
     used, faces = np.unique(surface.faces[chosen], return_inverse=True)
     faces = faces.reshape(-1, 3).astype(np.int32)
-    mesh = Mesh(surface.vertices[used], faces, surface.colors[used][faces[:, 0]])
+    mesh = Mesh(surface.vertices[used].astype(np.float64), faces, surface.colors[used][faces[:, 0]])
     keep = face_areas(mesh) > 0.0
     return mesh if keep.all() else Mesh(mesh.vertices, faces[keep], surface.colors[used][faces[keep, 0]])

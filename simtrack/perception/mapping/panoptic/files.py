@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from simtrack.errors import FileFormatError, MeshError
-from simtrack.geometry.meshes import Mesh, load_mesh
+from simtrack.geometry.meshes import load_mesh
 from simtrack.objects.export import write_ply
 from simtrack.perception.mapping.panoptic.entities import MapEntityMesh, extract_surface
 from simtrack.perception.mapping.panoptic.panoptic_map import PanopticMap
@@ -57,7 +57,7 @@ def write_surface(panoptic_map: PanopticMap, entities: Sequence[MapEntityMesh], 
             ids[label] = classes[each.semantic_class], each.instance
     of_vertex = np.zeros((len(surface.vertices), 2), np.int32)
     of_vertex[surface.faces] = ids[canonical[surface.labels]][:, None]
-    mesh = Mesh(surface.vertices, surface.faces, surface.colors[surface.faces[:, 0]])
+    mesh = surface.mesh
     comments = [f"class_id {number} {name}" for name, number in classes.items()]
     write_ply(path, mesh, labels={"class_id": of_vertex[:, 0], "instance": of_vertex[:, 1]}, comments=comments)
 

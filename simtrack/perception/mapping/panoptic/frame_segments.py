@@ -144,7 +144,8 @@ def _points(mask: np.ndarray, depth: Float32, intrinsics: CameraIntrinsics, stri
     v, u = np.nonzero(mask)
     v, u = v * stride, u * stride
     z = depth[v, u].astype(float)
-    points = np.stack([(u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z, z], axis=1)
+    x, y = (u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z
+    points = np.stack([x, y, z], axis=1).astype(np.float64)
     cells = np.floor(points / cell).astype(np.int64) + (1 << 20)
     return points[np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_index=True)[1]]
 
@@ -153,11 +154,11 @@ def _clusters(groups: Sequence[Float64], distance: float) -> np.ndarray:
     """(N,) number of the cluster of each group of points: single linkage, at most `distance` metres apart."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     points = np.concatenate(groups)
     owner = np.repeat(np.arange(len(groups)), [len(g) for g in groups])
-    pairs = cKDTree(points).query_pairs(distance, output_type="ndarray") if len(points) else np.empty((0, 2), int)
+    pairs = KDTree(points).query_pairs(distance, output_type="ndarray") if len(points) else np.empty((0, 2), int)
     links = owner[pairs]
     links = links[links[:, 0] != links[:, 1]]
     graph = coo_matrix((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), (len(groups),) * 2)

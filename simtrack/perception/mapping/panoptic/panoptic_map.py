@@ -1,7 +1,7 @@
 """The panoptic map: frames in, entities out."""
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from simtrack.perception.segmentation.geometric import GeometricConfig, depth_se
 from simtrack.perception.segmentation.panoptic import PanopticSegments
 
 Method: TypeAlias = Literal["full", "no-joint-fusion", "voxbloxpp"]
-METHODS: tuple[Method, ...] = get_args(Method)
+METHODS: tuple[Method, ...] = ("full", "no-joint-fusion", "voxbloxpp")
 
 
 @dataclass(frozen=True, slots=True)
