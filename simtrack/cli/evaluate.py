@@ -2,9 +2,12 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from simtrack.perception.mapping.panoptic.panoptic_map import Method
 
 
 def evaluate(
@@ -49,7 +52,9 @@ def evaluate(
     return _reconstruction(rooms, entities, stages, out, folder, workers)
 
 
-def _panoptic(rooms: str, method: str, strength: float, frames: int, voxel: float, out: Path, work: Path) -> int:
+def _panoptic(
+    rooms: str, method: "Method | Literal['all']", strength: float, frames: int, voxel: float, out: Path, work: Path
+) -> int:
     from simtrack.cli import console
     from simtrack.errors import InvalidValueError
     from simtrack.evaluation.panoptic_rooms import RoomMapTask, evaluate_maps, summed, tables_of, write_panoptic
@@ -62,7 +67,7 @@ def _panoptic(rooms: str, method: str, strength: float, frames: int, voxel: floa
         raise InvalidValueError("strength", strength, "0 to 3")
     FilmConfig(frames=frames)  # refuse bad values before hours of work
     VolumeConfig(voxel=voxel)
-    methods = tuple(name for name in METHODS if method in (name, "all"))
+    methods = METHODS if method == "all" else (method,)
     tasks = [RoomMapTask(seed, kitchen, methods, strength, frames, voxel) for seed, kitchen in parse_rooms(rooms)]
     with console.ProgressLine("evaluate panoptic", "looking for rooms that are done") as line:
         try:

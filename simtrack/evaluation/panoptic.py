@@ -8,10 +8,11 @@ Definitions
 * PQ, SQ, RQ (Kirillov et al., CVPR 2019; Eq. 15 of the reconstruction paper): entities of equal class match at an IoU
   above 0.5. Stuff is one entity a class. A true thing of which less than `LEAST_SEEN` was seen is void: not missed
   if it is not found, and what lies mostly on it is not wrong.
-* AP: area under the precision-recall curve with its envelope; classes that are there and never predicted have 0.
+* AP: best precision at 11 recalls and beyond, 0 where they are not reached (PASCAL VOC 2007); classes that are there
+  and never predicted have 0.
 * The lenient definition, which is the one of the paper's code: labels are carried to the nearest predicted point
-  however far, so unseen surface counts for nothing; AP at 11 recalls, where the last precision counts for all recalls
-  that were not reached; classes never predicted are left out.
+  however far, so unseen surface counts for nothing; in AP the last precision counts for all recalls that were not
+  reached; classes never predicted are left out.
 """
 
 from collections.abc import Mapping, Sequence
@@ -159,7 +160,6 @@ class Comparison:
 
 def compare(predicted: Sequence[PanopticEntity], true: TrueSurface, lenient: bool = False) -> Comparison:
     """Give every true point to a predicted entity, see above; or every predicted point to a true one."""
-    from scipy.spatial import KDTree
 
     def joined(entities: Sequence[PanopticEntity]) -> tuple[Float64, np.ndarray]:
         owner = np.repeat(np.arange(len(entities)), [len(e.points) for e in entities])
@@ -173,8 +173,8 @@ def compare(predicted: Sequence[PanopticEntity], true: TrueSurface, lenient: boo
         far = np.full(len(surface), np.inf)
         return Comparison(tuple(predicted), true, np.zeros(shape, np.int32), sizes[0], sizes[1].astype(np.int32),
                           np.full(len(points), np.inf), far)  # fmt: skip
-    accuracy, nearest_true = map(np.asarray, KDTree(surface).query(points))
-    completeness, nearest = map(np.asarray, KDTree(points).query(surface))
+    accuracy, nearest_true = _nearest(surface, points)
+    completeness, nearest = _nearest(points, surface)
     if lenient:
         pairs = of_point * shape[1] + of_surface[nearest_true]
         sizes = np.bincount(of_point, minlength=shape[0])
@@ -190,6 +190,14 @@ def compare(predicted: Sequence[PanopticEntity], true: TrueSurface, lenient: boo
         tuple(predicted), true, common.astype(np.int32), sizes.astype(np.int32), true_sizes.astype(np.int32),
         accuracy, completeness,
     )  # fmt: skip
+
+
+def _nearest(points: Float64, queries: Float64) -> tuple[Float64, np.ndarray]:
+    """(Q,) distances to the nearest points, and which they are."""
+    from scipy.spatial import KDTree
+
+    distances, index = KDTree(points).query(queries)
+    return np.asarray(distances, np.float64), np.asarray(index, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,12 +273,10 @@ class ScoredClass:
         order = np.argsort([-score for score, _ in self.hits], kind="stable")
         right = np.cumsum([self.hits[k][1] for k in order])
         precision, recall = right / np.arange(1, len(right) + 1), right / self.true
-        if lenient:
-            levels = np.linspace(0.0, 1.0, 11)
-            at = [precision[recall >= level].max(initial=0.0) or precision[-1] for level in levels]
-            return float(np.mean(at))
-        envelope = np.maximum.accumulate(precision[::-1])[::-1]
-        return float((np.diff(recall, prepend=0.0) * envelope).sum())
+        beyond = float(precision[-1]) if lenient else 0.0
+        levels = np.arange(11) / 10.0 - 1e-12
+        best = [precision[recall >= level].max() if recall[-1] >= level else beyond for level in levels]
+        return float(np.mean(best))
 
 
 def scored_classes(

@@ -45,22 +45,24 @@ class Volume:
 
     def __init__(self, config: VolumeConfig | None = None) -> None:
         self.config = config or VolumeConfig()
+        room = min(_FIRST, self.config.max_blocks)
         self.count = 0
         """Blocks that there are."""
-        self.keys = np.zeros(_FIRST, np.int64)
+        self.keys = np.zeros(room, np.int64)
         """(C,), see `volume_kernels`."""
-        self.table = np.full(4 * _FIRST, -1, np.int32)
-        self.distances = np.zeros((_FIRST, kernels.VOXELS), np.float32)
+        self.table = np.empty(0, np.int32)
+        self.distances = np.zeros((room, kernels.VOXELS), np.float32)
         """(C, 512), metres, positive before the surface."""
-        self.weights = np.zeros((_FIRST, kernels.VOXELS), np.float32)
+        self.weights = np.zeros((room, kernels.VOXELS), np.float32)
         """(C, 512), 1/m^2 summed over images; 0 = never seen."""
-        self.colors = np.zeros((_FIRST, kernels.VOXELS, 3), np.uint8)
+        self.colors = np.zeros((room, kernels.VOXELS, 3), np.uint8)
         """(C, 512, 3) RGB."""
-        self.labels = np.zeros((_FIRST, kernels.VOXELS), np.int32)
+        self.labels = np.zeros((room, kernels.VOXELS), np.int32)
         """(C, 512), of segments; 0 = none."""
-        self.support = np.zeros((_FIRST, kernels.VOXELS), np.int16)
+        self.support = np.zeros((room, kernels.VOXELS), np.int16)
         """(C, 512), observations for the label less those for others."""
-        self._seen, self._turn = np.full(_FIRST, -1, np.int32), 0
+        self._seen, self._turn = np.full(room, -1, np.int32), 0
+        self._rehash(room)
 
     @property
     def nbytes(self) -> int:
@@ -162,7 +164,7 @@ class Volume:
 
     def _grow(self) -> None:
         """Make room for half as many blocks again."""
-        size = min(max(len(self.keys) * 3 // 2, _FIRST), self.config.max_blocks + 1)
+        size = min(len(self.keys) * 3 // 2 + 1, self.config.max_blocks)
         for name in ("keys", "distances", "weights", "colors", "labels", "support", "_seen"):
             old: np.ndarray = getattr(self, name)
             new = np.zeros((size, *old.shape[1:]), old.dtype)
