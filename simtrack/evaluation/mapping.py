@@ -45,6 +45,8 @@ class MappedScene:
     """What the camera saw, where the truth is known."""
     seconds: float
     """CPU time of mapping, segmentation of images and rendering excepted."""
+    T_map_first: Float64 | None = None
+    """(4, 4), where the camera began."""
 
     @property
     def frames_per_second(self) -> float:
@@ -71,9 +73,11 @@ def map_scenes(
     """Fuse all frames of a source into several maps, which get the same segments; see `map_scene`."""
     maps, seconds = [PanopticMap(config) for config in configs], np.zeros(len(configs))
     seen = None if source.room is None else SeenSurface(source.room, maps[0].config.max_depth)
+    T_map_first: Float64 | None = None
     with source.held:
         for number, entry in enumerate(source.frames(), start=1):
             segments = source.segmenter.segment(entry.frame)
+            T_map_first = entry.T_map_camera if T_map_first is None else T_map_first
             geometric, first = None, 0.0
             if len(maps) > 1:  # all take the same
                 start, far = time.process_time(), entry.frame.depth > maps[0].config.max_depth
@@ -94,7 +98,8 @@ def map_scenes(
     for panoptic_map, spent in zip(maps, seconds.tolist(), strict=True):
         start = time.process_time()
         entities = panoptic_map.entities()
-        made.append(MappedScene(source.name, panoptic_map, entities, seen, spent + time.process_time() - start))
+        spent += time.process_time() - start
+        made.append(MappedScene(source.name, panoptic_map, entities, seen, spent, T_map_first))
     return tuple(made)
 
 

@@ -11,7 +11,7 @@ from simtrack.evaluation.mapping import MappedScene
 from simtrack.evaluation.metrics import Metrics, write_atomically
 from simtrack.evaluation.record import encode_jpeg
 from simtrack.geometry.meshes import Mesh, area
-from simtrack.geometry.transforms import look_at
+from simtrack.geometry.transforms import look_at, transform
 from simtrack.perception.mapping.panoptic.entities import STUFF_FIRST, extract_surface
 from simtrack.report.colors import class_colors
 from simtrack.report.headline import format_metric
@@ -46,12 +46,12 @@ def render(mapped: MappedScene, metrics: Metrics) -> str:
     extent = surface if len(surface.faces) else None
     pictures = []
     if extent is not None:
-        for title, T, camera, reach, near in _cameras(extent):
+        for title, T, camera, reach in _cameras(extent, mapped):
             views = [("map, by class", _classes(found, colors)), ("truth", _classes(true, colors))]
             views = [view for view in views if view[1]]
             views.append(("map, as it looked", [(surface, _own_colors(surface))]))
             pictures.append(
-                (title, [(name, _picture(shaded(meshes, T, camera, reach, near=near, backs=False), f"{title}: {name}"))
+                (title, [(name, _picture(shaded(meshes, T, camera, reach, backs=False), f"{title}: {name}"))
                          for name, meshes in views])
             )  # fmt: skip
     rows = [
@@ -71,17 +71,23 @@ def render(mapped: MappedScene, metrics: Metrics) -> str:
     )
 
 
-def _cameras(mesh: Mesh) -> list[tuple[str, Float64, CameraIntrinsics, float, float]]:
-    """From above and from the side: title, T_map_camera, intrinsics, reach and near limit."""
+def _cameras(mesh: Mesh, mapped: MappedScene) -> list[tuple[str, Float64, CameraIntrinsics, float]]:
+    """From above and from the side: title, T_map_camera, intrinsics and reach.
+
+    Nobody knows which way is up in a recording; it is looked at from behind its camera's first place.
+    """
     low, high = mesh.bounds
     middle, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
     f = 0.5 * SUPERSAMPLING * WIDTH / np.tan(0.5 * FOV)
     w, h = SUPERSAMPLING * WIDTH, SUPERSAMPLING * HEIGHT
     camera = CameraIntrinsics(w, h, f, f, (w - 1) / 2, (h - 1) / 2)
     far = radius / np.tan(0.5 * FOV)
+    if mapped.seen is None and mapped.T_map_first is not None:
+        behind = mapped.T_map_first @ transform(None, (0.0, 0.0, -0.25 * radius))
+        return [("From behind the camera", behind, camera, 6.0 * far)]
     above = look_at(middle + [0.0, -1e-3, 1.15 * far], middle, np.array([0.0, 1.0, 0.0]))
     side = look_at(middle + far * np.array([-0.5, -0.75, 0.75]), middle)
-    return [("From above", above, camera, 6.0 * far, 0.0), ("From the side", side, camera, 6.0 * far, 0.0)]
+    return [("From above", above, camera, 6.0 * far), ("From the side", side, camera, 6.0 * far)]
 
 
 def _classes(entities: Sequence[tuple[str, Mesh]], colors: Mapping[str, str]) -> list[tuple[Mesh, Float64]]:

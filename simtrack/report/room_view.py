@@ -78,7 +78,6 @@ def shaded(
     intrinsics: CameraIntrinsics,
     reach: float,
     *,
-    near: float = 0.0,
     backs: bool = True,
 ) -> Uint8:
     """(HEIGHT, WIDTH, 3) RGB of meshes with (F, 3) colours.
@@ -88,7 +87,6 @@ def shaded(
         T_map_camera: (4, 4).
         intrinsics: of an image that is reduced by `SUPERSAMPLING`.
         reach: metres along the optical axis beyond which nothing is drawn.
-        near: ... and before which nothing is.
         backs: whether faces that look away from the camera are seen.
     """
     import cv2
@@ -105,7 +103,7 @@ def shaded(
                 continue
             scene.add(TriangleMesh(mesh.vertices, mesh.faces, str(number)), instance=number)
         bundle = RayBundle.from_camera(intrinsics)
-        hits = scene.cast(bundle, T_map_camera, reach, min_distance=near)
+        hits = scene.cast(bundle, T_map_camera, reach)
         rays = bundle.directions @ T_map_camera[:3, :3].T
         for number, (mesh, colors) in enumerate(meshes):
             own = np.flatnonzero(hits.hit & (hits.instances == number))

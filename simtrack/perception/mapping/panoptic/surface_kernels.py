@@ -67,6 +67,7 @@ def vertices(around, keys, distances, weights, colors, voxel, least, cells, poin
                     n = (k * SIDE + j) * SIDE + i
                     if not weights[block, n] >= least:
                         continue
+                    nearest_block, nearest, least_off = block, n, np.float32(np.inf)
                     for corner in range(8):
                         b, m = _voxel(around, block, i + (corner & 1), j + ((corner >> 1) & 1), k + (corner >> 2))
                         if b < 0 or not weights[b, m] >= least:
@@ -74,6 +75,8 @@ def vertices(around, keys, distances, weights, colors, voxel, least, cells, poin
                             break
                         values[corner] = distances[b, m]
                         below += values[corner] < 0.0
+                        if abs(values[corner]) < least_off:
+                            nearest_block, nearest, least_off = b, m, abs(values[corner])
                     if not known or below == 0 or below == 8:
                         continue
                     if found < len(points):
@@ -92,7 +95,7 @@ def vertices(around, keys, distances, weights, colors, voxel, least, cells, poin
                         points[found, 1] = (SIDE * by + j + y / crossed) * voxel
                         points[found, 2] = (SIDE * bz + k + z / crossed) * voxel
                         for c in range(3):
-                            tints[found, c] = colors[block, n, c]
+                            tints[found, c] = colors[nearest_block, nearest, c]
                     cells[block, n] = found
                     found += 1
     return found
