@@ -508,6 +508,15 @@ class Command:
 
 
 @runtime_checkable
+class SceneGraphBuilder(Protocol):
+    """Says what stands how to what."""
+
+    def update(self, stamp: int, tracks: Sequence[Track]) -> Set[Relation]:
+        """Take what is tracked at `stamp`, nanoseconds, and answer with all relations that hold then."""
+        ...
+
+
+@runtime_checkable
 class Agent(Protocol):
     """Decides from the stack's output where the robot looks and drives."""
 

@@ -19,6 +19,7 @@ def run(
     tracker: str | None = None,
     localizer: str | None = None,
     detector: str = "oracle",
+    scene_graph: str | None = None,
     stage_limit: float = 5.0,
     renderer: Literal["mujoco", "embree"] = "mujoco",
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
@@ -39,6 +40,7 @@ def run(
         tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
         localizer: A localizer of yours, package.module:Class, or oracle: one that knows the truth.
         detector: What detects objects in images: oracle, or package.module:Class.
+        scene_graph: What says how things stand to each other, of yours, package.module:Class.
         stage_limit: Seconds that a stage of yours has for a frame; after that the frame counts as missed.
         renderer: mujoco needs OpenGL (EGL), embree needs none.
         overwrite: Replace the results in an existing folder.
@@ -63,7 +65,7 @@ def run(
     config = RunConfig(
         scene=loaded, out=folder, duration=duration, seed=seed, agent=agent, detector=detector, renderer=renderer,
         overwrite=overwrite, log=log, compare_gaze=compare_gaze, threads=threads,
-        tracker=tracker, localizer=localizer, stage_limit=stage_limit,
+        tracker=tracker, localizer=localizer, scene_graph=scene_graph, stage_limit=stage_limit,
     )  # fmt: skip
     observers = _observers(view, rrd)
     with console.ProgressLine(f"{loaded.name} · seed {seed}") as line, cold_start_told(line.say):

@@ -210,6 +210,7 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
             config=config.stack,
             localizer=OracleLocalizer(simulation.truth) if config.localizer == ORACLE else foreign.localizer,
             tracker=foreign.tracker,
+            scene_graph=foreign.scene_graph,
         )
         exits.callback(stack.close)
         yield Loop(simulation, stack, make_agent(agent, context), start, foreign.watches, config.script)

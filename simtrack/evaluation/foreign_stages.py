@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from simtrack.contracts import Detector, Localizer, Tracker
+from simtrack.contracts import Detector, Localizer, SceneGraphBuilder, Tracker
 from simtrack.evaluation.metrics import Metric, Metrics, ratio
 from simtrack.evaluation.run_config import ORACLE, RunConfig
 from simtrack.perception.foreign import (
     FaultKind,
     GuardedDetector,
     GuardedLocalizer,
+    GuardedSceneGraph,
     GuardedTracker,
     StageContext,
     StageFault,
@@ -33,11 +34,13 @@ class ForeignStages:
     tracker: GuardedTracker | None = None
     localizer: GuardedLocalizer | None = None
     detector: GuardedDetector | None = None
+    scene_graph: GuardedSceneGraph | None = None
 
     @property
     def watches(self) -> list[Watch]:
         """Of all that there are."""
-        return [part.watch for part in (self.tracker, self.localizer, self.detector) if part is not None]
+        parts = (self.tracker, self.localizer, self.detector, self.scene_graph)
+        return [part.watch for part in parts if part is not None]
 
 
 @contextmanager
@@ -49,7 +52,7 @@ def foreign_stages(config: RunConfig, context: StageContext) -> Iterator[Foreign
     """
     limit = config.stage_limit
     with ExitStack() as exits:
-        tracker = localizer = detector = None
+        tracker = localizer = detector = scene_graph = None
         if config.tracker is not None:
             built = cast(Tracker, build_stage("tracker", config.tracker, context))
             tracker = GuardedTracker(built, context.models, limit)
@@ -61,14 +64,18 @@ def foreign_stages(config: RunConfig, context: StageContext) -> Iterator[Foreign
         if config.detector != ORACLE:
             detector = GuardedDetector(cast(Detector, build_stage("detector", config.detector, context)), limit)
             exits.callback(detector.close)
-        yield ForeignStages(tracker, localizer, detector)
+        if config.scene_graph is not None:
+            built = cast(SceneGraphBuilder, build_stage("scene graph", config.scene_graph, context))
+            scene_graph = GuardedSceneGraph(built, limit)
+            exits.callback(scene_graph.close)
+        yield ForeignStages(tracker, localizer, detector, scene_graph)
 
 
 def fault_metrics(watches: Sequence[Watch]) -> Metrics:
     """``foreign.<stage>.*``: frames handed over and missed, by kind of fault; remarks say which frames they were."""
     metrics: Metrics = {}
     for watch in watches:
-        name, faults = f"foreign.{watch.stage}", list(watch.faults)
+        name, faults = f"foreign.{watch.stage.replace(' ', '_')}", list(watch.faults)
         missed = sorted({fault.frame for fault in faults})
         metrics[f"{name}.frames"] = Metric(watch.frames, "1")
         metrics[f"{name}.missed_frames"] = Metric(len(missed), "1", f"frames {spans(missed)}" if missed else "")

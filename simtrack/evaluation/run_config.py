@@ -41,6 +41,8 @@ class RunConfig:
     """``package.module:Class`` or ``exec:program``; simtrack's own if None."""
     localizer: str | None = None
     """``package.module:Class``, or the oracle; simtrack's own if None."""
+    scene_graph: str | None = None
+    """``package.module:Class``; simtrack's own if None."""
     stage_limit: float = DEFAULT_LIMIT
     """Seconds of the wall clock that a stage of somebody else's has for a frame."""
     renderer: str = "mujoco"
@@ -81,7 +83,10 @@ class RunConfig:
     @property
     def foreign(self) -> dict[str, str]:
         """Stage -> what was given for it, of those that are not simtrack's."""
-        given = {"tracker": self.tracker, "localizer": self.localizer, "detector": self.detector}
+        given = {
+            "tracker": self.tracker, "localizer": self.localizer, "detector": self.detector,
+            "scene graph": self.scene_graph,
+        }  # fmt: skip
         return {stage: name for stage, name in given.items() if name is not None and name != ORACLE}
 
     @property
@@ -99,6 +104,7 @@ class RunConfig:
             "detector": self.detector,
             "tracker": self.tracker,
             "localizer": self.localizer,
+            "scene_graph": self.scene_graph,
             "oracle": plain(asdict(self.oracle)),
             "stage_limit": self.stage_limit,
             "renderer": self.renderer,

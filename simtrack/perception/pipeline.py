@@ -45,6 +45,7 @@ from simtrack.contracts import (
     Presegmentation,
     Relation,
     RgbdFrame,
+    SceneGraphBuilder,
     SensorFrame,
     StaticMap,
     Status,
@@ -118,6 +119,7 @@ class PerceptionStack:
         config: StackConfig | None = None,
         localizer: Localizer | None = None,
         tracker: Tracker | None = None,
+        scene_graph: SceneGraphBuilder | None = None,
     ) -> None:
         """Build the stack.
 
@@ -130,6 +132,7 @@ class PerceptionStack:
             config: settings.
             localizer: replaces MICP-L.
             tracker: replaces the ray-tracing tracker.
+            scene_graph: replaces the scene graph's relations in beliefs; `graph` goes on beside it.
 
         """
         self.config = config or StackConfig()
@@ -152,6 +155,7 @@ class PerceptionStack:
             ArticulationTracker(static_map, self.config.articulation) if static_map.articulations else None
         )
         self.graph = SceneGraph(static_map, models, self.config.scene_graph)
+        self._relations = scene_graph
         self.detections = DetectorRunner(detector, models, self.config.runner)
         self.on_detection: Callable[[DetectionResult], None] | None = None
         """Called with every answer of the detector as it is given (recorders listen here)."""
@@ -381,7 +385,8 @@ class PerceptionStack:
             self.on_detection(result)
 
     def _relate(self, stamp: int, tracked: TrackerResult) -> Set[Relation]:
-        return self.graph.update(stamp, tracked.tracks)
+        relations = self.graph.update(stamp, tracked.tracks)
+        return relations if self._relations is None else self._relations.update(stamp, tracked.tracks)
 
     # ---------------------------------------------------------------------------------------------------------- support
 

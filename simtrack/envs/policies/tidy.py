@@ -1,6 +1,6 @@
 """Tidies up: grasps what is not where it should be, and puts it where the goal will hold. Sees beliefs only."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -35,7 +35,11 @@ DWELL = 12
 TRIES = 12
 """Places that are tried before what is held goes back."""
 PATIENCE, REST = 60, 3
-"""Steps that a turn may take, and after which the robot stands still."""
+"""Steps that a turn or a drive may take, and after which the robot stands still."""
+ASIDE = (0.08, 0.6)
+"""Metres that a step to the side is worth, and that it goes at most."""
+DRIVE_GAIN, DRIVE_LEAST, FASTEST = 1.2, 0.01, 0.25
+"""1/s, metres that do not matter, and m/s."""
 
 
 class TidyPolicy:
@@ -84,9 +88,15 @@ class TidyPolicy:
             yield from self._look_for(name)
         if self._places.margin(goal, self._belief) >= FLUENT:
             return
-        yield from self._grasp(goal.subject)
+        heading = yaw_of(self._belief.localization.T_map_base)
+        if not self._holds:
+            yield from self._grasp(goal.subject)
         if self._holds:
             yield from self._put(goal)
+            # What was believed before it was carried is not worth much: look at both again, from where they were seen.
+            yield from self._turn_to(heading)
+            for name in (goal.subject, goal.reference):
+                yield from self._look_for(name)
         yield from self._look(0.0, DWELL)
 
     def _look_for(self, name: str) -> Plan:
@@ -108,7 +118,7 @@ class TidyPolicy:
     def _grasp(self, name: str) -> Plan:
         track = believed(self._belief, name)
         spot = None if track is None else suction_spot(self._briefing.models[name], track.T_map_object)
-        if spot is None or not (yield from self._stand(spot)):
+        if spot is None or not (yield from self._approach(spot)):
             return
         track = believed(self._belief, name)
         spot = None if track is None else suction_spot(self._briefing.models[name], track.T_map_object)
@@ -119,27 +129,52 @@ class TidyPolicy:
                 self._memory.pop(name, None)
 
     def _put(self, goal: Relation) -> Plan:
-        """Try places until one is within reach; if none is, what is held goes back to where it was."""
+        """Try places until one is within reach; if none is, from beside; if still none, it goes back where it was."""
         spots = self._places.spots(goal, self._belief, self._grasped)
         if not spots:
             yield from self._look_for(goal.reference)
             spots = self._places.spots(goal, self._belief, self._grasped)
+        if (yield from self._place_at(spots)):
+            return
+        reference = believed(self._belief, goal.reference)
+        towards = spots[0].position if spots else None if reference is None else reference.T_map_object[:3, 3]
+        if towards is not None and (yield from self._sidestep(float(self._in_base(towards)[1]))):
+            yield from self._look_for(goal.reference)
+            if (yield from self._place_at(self._places.spots(goal, self._belief, self._grasped))):
+                return
         origin = self._grasped[:3, 3]
-        for spot in [*spots[:: max(1, len(spots) // TRIES)], Spot(origin, yaw_of(self._grasped), 0.0)]:
+        if (yield from self._approach(origin)):
+            yield from self._place_at([Spot(origin, yaw_of(self._grasped), 0.0)])
+
+    def _place_at(self, spots: Sequence[Spot]) -> Generator[Float32, None, bool]:
+        """Put what is held down at one of some places, the best first; whether that was done."""
+        origin = self._grasped[:3, 3]
+        for spot in spots[:: max(1, len(spots) // TRIES)]:
             turn = spot.heading - yaw_of(self._grasped)
             R = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
             if (yield from self._stand(spot.position + R @ (self._spot - origin))):
                 heading = spot.heading - yaw_of(self._belief.localization.T_map_base)
                 yield from self._ask(Request("place", self._in_base(spot.position), heading))
                 if not self._holds:
-                    return
+                    return True
+        return False
+
+    def _approach(self, place: Float64) -> Generator[Float32, None, bool]:
+        """Turn so that a place (3,) of the map is within reach, if need be after a step to the side; whether it is."""
+        if (yield from self._stand(place)):
+            return True
+        return (yield from self._sidestep(float(self._in_base(place)[1]))) and (yield from self._stand(place))
 
     def _stand(self, place: Float64) -> Generator[Float32, None, bool]:
         """Turn so that a place (3,) of the map is within reach; False if no turn helps."""
         turn = self._reach.turn(place, self._belief.localization.T_map_base, self._torso)
         if turn is None:
             return False
-        wanted = yaw_of(self._belief.localization.T_map_base) + turn
+        yield from self._turn_to(yaw_of(self._belief.localization.T_map_base) + turn)
+        return True
+
+    def _turn_to(self, wanted: float) -> Plan:
+        """To a heading in the map, radians; then stand still."""
         for _ in range(PATIENCE):
             gap = wrapped(wanted - yaw_of(self._belief.localization.T_map_base))
             if abs(gap) < TURN_LEAST:
@@ -147,6 +182,25 @@ class TidyPolicy:
             yield self._move(angular=float(np.clip(TURN_GAIN * gap, -0.6, 0.6)))
         for _ in range(REST):
             yield self._move()
+
+    def _sidestep(self, left: float) -> Generator[Float32, None, bool]:
+        """So many metres to the left (right if negative), looking where it looked before; whether it is worth it.
+
+        Along the furniture before it, where it could turn and has driven: there the floor is free.
+        """
+        way = float(np.clip(left, -ASIDE[1], ASIDE[1]))
+        if abs(way) < ASIDE[0]:
+            return False
+        T = self._belief.localization.T_map_base
+        heading, course = yaw_of(T), T[:2, 1] * np.sign(way)
+        yield from self._turn_to(heading + np.sign(way) * np.pi / 2)
+        for _ in range(PATIENCE):
+            gone = self._belief.localization.T_map_base[:2, 3] - T[:2, 3]
+            gap = abs(way) - float(gone @ course)
+            if abs(gap) < DRIVE_LEAST:
+                break
+            yield self._move(linear=float(np.clip(DRIVE_GAIN * gap, -FASTEST, FASTEST)))
+        yield from self._turn_to(heading)
         return True
 
     def _ask(self, request: Request) -> Plan:
@@ -157,8 +211,12 @@ class TidyPolicy:
 
     # --------------------------------------------------------------------------------------------------------- actions
 
-    def _move(self, angular: float = 0.0, pan: float = 0.0) -> Float32:
-        speeds = {"angular": angular / AXES["angular"], "pan": (pan - self._pan) * CONTROL_HZ / AXES["pan"] / 2.0}
+    def _move(self, angular: float = 0.0, pan: float = 0.0, linear: float = 0.0) -> Float32:
+        speeds = {
+            "linear": linear / AXES["linear"],
+            "angular": angular / AXES["angular"],
+            "pan": (pan - self._pan) * CONTROL_HZ / AXES["pan"] / 2.0,
+        }
         return np.clip(vector(speeds, self._briefing.layout.macros), -1.0, 1.0)
 
     def _in_base(self, place: Float64) -> Float64:

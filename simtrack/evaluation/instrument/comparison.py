@@ -9,7 +9,7 @@ from simtrack.evaluation.instrument.statistics import Difference, Estimate, diff
 from simtrack.evaluation.metrics import Metrics, read_metrics
 from simtrack.evaluation.run_config import ORACLE
 
-STAGES = ("tracker", "localizer", "detector", "agent")
+STAGES = ("tracker", "localizer", "scene_graph")
 MORE_IS_BETTER = (
     "recall", "auc", "bop", "hota", "accuracy", "f1", "known_share", "known_rejected", "unknown_recall",
     "objects_found", "trusted_share", "inside_share", "frames_per_second", "gaze_gain", "reduction",
@@ -59,7 +59,7 @@ def read_run(path: Path) -> Run:
     partial = metrics.get("run.partial")
     if partial is None or partial.value is not False:
         raise FileFormatError(path / "metrics.json", "run.partial", "the run was stopped before its end")
-    foreign = [str(config[stage]) for stage in STAGES[:2] if config.get(stage)]
+    foreign = [str(config[stage]) for stage in STAGES if config.get(stage)]
     foreign += [str(config["detector"])] if config.get("detector", ORACLE) != ORACLE else []
     return Run(path, scene, seed, " + ".join(foreign) or "simtrack", metrics)
 

@@ -3,7 +3,7 @@
 Each check returns what is wrong in a few words, an empty string if nothing is.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Set
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from simtrack.contracts import (
     DetectionResult,
     Float64,
     Localization,
+    Relation,
     RgbdFrame,
     Status,
     Track,
@@ -132,6 +133,20 @@ def wrong_detections(result: object, stamp: int) -> str:
                 return f"detection {number}: {field} is not {shape} finite numbers"
         if not (detection.keypoint_sigma > 0.0).all() or not 0.0 <= detection.score <= 1.0:
             return f"detection {number}: keypoint_sigma has to be positive, score 0 to 1"
+    return ""
+
+
+def wrong_relations(found: object, names: Collection[str]) -> str:
+    """Of a scene graph builder's answer, whose relations have one of `names`."""
+    if not isinstance(found, Set):
+        return f"update returned {_kind(found)}, not a set of Relation"
+    for relation in found:
+        if not isinstance(relation, Relation):
+            return f"the relations hold {_kind(relation)}, not a Relation"
+        if relation.name not in names:
+            return f"no relation is called {relation.name!r}; known: {', '.join(sorted(names))}"
+        if not isinstance(relation.subject, str) or not isinstance(relation.reference, str):
+            return f"{relation.name}: subject and reference are names of entities"
     return ""
 
 

@@ -1,6 +1,6 @@
 """Foreign stages behind the Protocols: one that raises, hangs or answers nonsense misses a frame, and nothing else."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 
@@ -16,13 +16,22 @@ from simtrack.contracts import (
     Odometry,
     PoseHypothesis,
     RegionOfInterest,
+    Relation,
     RgbdFrame,
+    SceneGraphBuilder,
     Status,
+    Track,
     Tracker,
     TrackerResult,
 )
-from simtrack.perception.foreign.answers import wrong_detections, wrong_localization, wrong_tracks
+from simtrack.perception.foreign.answers import (
+    wrong_detections,
+    wrong_localization,
+    wrong_relations,
+    wrong_tracks,
+)
 from simtrack.perception.foreign.watch import Watch
+from simtrack.perception.scene_graph.relations import RELATIONS
 
 DEFAULT_LIMIT = 5.0
 """Seconds of the wall clock for a frame."""
@@ -123,6 +132,24 @@ class GuardedDetector(_Guard):
             lambda answer: wrong_detections(answer, frame.stamp),
         )
         return found if found is not None else DetectionResult(frame.stamp, frame.stamp, (), Status.FAILED)
+
+
+class GuardedSceneGraph(_Guard):
+    """A builder of relations whose failures are frames without any. Implements `SceneGraphBuilder`."""
+
+    def __init__(self, builder: SceneGraphBuilder, limit: float = DEFAULT_LIMIT) -> None:
+        """`limit`: seconds a frame."""
+        super().__init__("scene graph", builder, limit)
+        self._builder = builder
+
+    def update(self, stamp: int, tracks: Sequence[Track]) -> Set[Relation]:
+        """See `SceneGraphBuilder.update`; nothing on a frame that is missed."""
+        found = self.watch.call(
+            stamp,
+            lambda: self._builder.update(stamp, tuple(tracks)),
+            lambda answer: wrong_relations(answer, RELATIONS),
+        )
+        return frozenset(found) if found is not None else frozenset()
 
 
 def own(frame: RgbdFrame) -> RgbdFrame:

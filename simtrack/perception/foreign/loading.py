@@ -10,13 +10,15 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Protocol
 
-from simtrack.contracts import Detector, Float64, Localizer, StaticMap, Tracker
+from simtrack.contracts import Detector, Float64, Localizer, SceneGraphBuilder, StaticMap, Tracker
 from simtrack.errors import StageError
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.objects import ObjectModel
 from simtrack.perception.foreign.process_tracker import ProcessTracker
 
-PROTOCOLS: Mapping[str, type] = {"tracker": Tracker, "localizer": Localizer, "detector": Detector}
+PROTOCOLS: Mapping[str, type] = {
+    "tracker": Tracker, "localizer": Localizer, "detector": Detector, "scene graph": SceneGraphBuilder,
+}  # fmt: skip
 EXEC = "exec:"
 
 
@@ -44,7 +46,7 @@ def check_stage(stage: str, given: str) -> None:
     """Whether a stage can be loaded, before anything is built.
 
     Args:
-        stage: ``tracker``, ``localizer`` or ``detector``.
+        stage: ``tracker``, ``localizer``, ``detector`` or ``scene graph``.
         given: ``package.module:Class``, or ``exec:program`` for a tracker.
 
     Raises:

@@ -17,7 +17,9 @@ from simtrack.contracts import (
     DetectionResult,
     LidarScan,
     Localization,
+    Odometry,
     PoseHypothesis,
+    Relation,
     RgbdFrame,
     StaticMap,
     Status,
@@ -33,6 +35,7 @@ from simtrack.perception.foreign import (
     FaultKind,
     GuardedDetector,
     GuardedLocalizer,
+    GuardedSceneGraph,
     GuardedTracker,
     ProcessTracker,
     StageContext,
@@ -290,6 +293,43 @@ def test_the_program_of_the_documentation_runs(context: StageContext, models) ->
     results = follow(build_stage("tracker", f"exec:{sys.executable} {program}", context), models)
     assert [len(result.tracks) for result in results] == [0, 1, 1]
     assert np.allclose(results[2].tracks[0].T_camera_object, T_CAMERA_OBJECT, atol=1e-9)
+
+
+def test_the_templates_can_be_put_into_a_stack(context: StageContext, models, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(DOCS / "examples")
+    tracker = build_stage("tracker", "latest_detection:LatestDetection", context)
+    (track,) = follow(tracker, models)[2].tracks
+    T_below = track.T_map_object.copy()
+    T_below[2, 3] -= 0.2
+    below = replace(track, id=2, T_map_object=T_below)
+    graph = GuardedSceneGraph(build_stage("scene graph", "boxes_above:BoxesAbove", context))  # type: ignore[arg-type]
+    assert graph.update(0, (track, below)) == {Relation("relay-1", "above", "relay-2")}
+    localizer = GuardedLocalizer(build_stage("localizer", "odometry_only:OdometryOnly", context), None)  # type: ignore
+    localizer.predict(Odometry(PERIOD, T_MAP_CAMERA, 0.0, 0.0))
+    assert np.allclose(localizer.pose_at(PERIOD).T_map_base, T_MAP_CAMERA)
+    assert not graph.watch.faults and not localizer.watch.faults
+    graph.close()
+    localizer.close()
+
+
+NO_RELATIONS: dict[str, object] = {
+    "none": None, "list": ["on"], "names": {"on"}, "unknown": {Relation("a", "beneath", "b")},
+    "number": {Relation("a", "on", 3)},  # type: ignore[arg-type]
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NO_RELATIONS)
+def test_relations_that_are_none_are_a_missed_frame(name: str) -> None:
+    answer = NO_RELATIONS[name]
+
+    class Builder:
+        def update(self, stamp: int, tracks: object) -> object:
+            return answer
+
+    graph = GuardedSceneGraph(Builder())  # type: ignore[arg-type]
+    assert graph.update(0, ()) == frozenset()
+    assert [fault.kind for fault in graph.watch.faults] == [FaultKind.INVALID]
+    graph.close()
 
 
 PROGRAM = """
