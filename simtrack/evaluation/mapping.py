@@ -272,9 +272,11 @@ def score_metrics(scores: MapScores) -> Metrics:
         for suffix, lenient in (("", False), (".lenient", True)):
             value = mean_precision(table, lenient)
             missing = unmeasured("1", "nothing to be found")
+            if kind == "boxes_refined" and not scores.nodes:
+                value, missing = None, unmeasured("1", "the contact graph was not built")
             metrics[f"{kind}.map50{suffix}"] = missing if value is None else measured(value, "1")
     metrics["surface.accuracy.median"] = measured(scores.accuracy[0], "m")
     metrics["surface.accuracy.p95"] = measured(scores.accuracy[1], "m")
     metrics["surface.completeness"] = measured(scores.completeness, "1")
-    metrics["graph.distance_per_node"] = ratio(scores.distance, scores.nodes, "no nodes")
+    metrics["graph.distance_per_node"] = ratio(scores.distance, scores.nodes, "the contact graph was not built")
     return metrics
