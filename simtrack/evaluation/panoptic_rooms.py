@@ -251,7 +251,7 @@ def write_panoptic(done: Mapping[RoomMapTask, Results], folder: Path) -> list[st
         "figures": {m: {k: asdict(v) for k, v in score_metrics(s).items()} for m, s in total.items()},
         "rooms": [{"room": t.room, "scores": {m: scores_to_json(s) for m, s in r.items()}} for t, r in done.items()],
     }
-    write_atomically(folder / "panoptic.json", json.dumps(document, indent=1) + "\n")
+    write_atomically(folder / "panoptic.json", json.dumps(document) + "\n")
     lines = [f"{len(done)} rooms, {first.frames} frames each ({first.sensor}), voxels of {1e3 * first.voxel:g} mm, "
              f"oracle at strength {first.strength:g}", ""]  # fmt: skip
     for title, (columns, rows) in tables_of(done, total).items():
