@@ -90,6 +90,7 @@ def room_source(
     """
     from simtrack.simulation.building.rooms.physics import settled_room
 
+    OracleSegmenter(LatestLabels(), (), strength)  # refuses bad values before a room is built
     room = settled_room(seed, kind)
     shot = RoomFilm(room, film, film_seed)
     labels = LatestLabels()
