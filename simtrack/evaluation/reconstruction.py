@@ -103,6 +103,8 @@ class RoomOutcome:
     """Empty if the physics was not checked."""
     joints: tuple[JointOutcome, ...]
     """Likewise."""
+    fixed: tuple[str, ...]
+    """Entities that find no rest where they were seen, and are fixed there rather than free."""
     verdict: str
     problems: tuple[str, ...]
     """What speaks against the scene, as the check words it."""
@@ -185,7 +187,7 @@ def evaluate_room(
     import tempfile
 
     from simtrack.perception.reconstruction.files import write_scene
-    from simtrack.perception.reconstruction.reconstruct import reconstruct
+    from simtrack.perception.reconstruction.reconstruct import NoteCode, reconstruct
     from simtrack.perception.scene_graph.contact import build_contact_graph, entity_nodes
     from simtrack.plausibility.check import check_urdf
     from simtrack.simulation.building.rooms.physics import settled_room
@@ -198,9 +200,11 @@ def evaluate_room(
     graph_seconds = seconds = time.perf_counter() - start
     cpu_seconds = time.process_time() - processor
     models: tuple[ModelOutcome, ...] = ()
+    fixed: tuple[str, ...] = ()
     report: CheckReport | None = None
     if stages != "graph":
         made = reconstruct(graph, name=f"room {seed}")
+        fixed = tuple(note.entity for note in made.notes if note.code is NoteCode.UNSTABLE)
         with tempfile.TemporaryDirectory(prefix="simtrack-evaluate-") as temporary:
             files = write_scene(made.tree, temporary if folder is None else folder)
             seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - processor
@@ -208,7 +212,7 @@ def evaluate_room(
             if stages == "physics":
                 report = check_urdf(files.urdf)
     return outcome(
-        f"{kind or 'rooms'}:{seed}", room, entities, graph, models, report, (graph_seconds, seconds, cpu_seconds)
+        f"{kind or 'rooms'}:{seed}", room, entities, graph, models, fixed, report, (graph_seconds, seconds, cpu_seconds)
     )
 
 
@@ -218,6 +222,7 @@ def outcome(
     entities: Entities,
     graph: ContactGraph,
     models: tuple[ModelOutcome, ...],
+    fixed: tuple[str, ...],
     report: CheckReport | None,
     seconds: tuple[float, float, float],
 ) -> RoomOutcome:
@@ -251,6 +256,7 @@ def outcome(
         models=models,
         bodies=bodies,
         joints=() if report is None else joint_outcomes(report),
+        fixed=fixed,
         verdict="not checked" if report is None else report.verdict,
         problems=()
         if report is None
@@ -377,6 +383,7 @@ def _physics_figures(outcomes: Sequence[RoomOutcome]) -> Metrics:
         "physics.stable_scenes": ratio(sum(room.stable for room in checked), len(checked), "no scenes"),
         "physics.plausible_scenes": ratio(sum(r.verdict == "plausible" for r in checked), len(checked), "no scenes"),
         "physics.bodies": measured(len(bodies), "1"),
+        "physics.fixed_for_want_of_rest": measured(sum(len(room.fixed) for room in checked), "1"),
         "physics.stable_bodies": ratio(sum(body.stable for body in bodies), len(bodies), none),
         "physics.penetration.p99": quantile([body.penetration for body in bodies], 0.99, "m", none),
         "physics.gap.p99": quantile([body.gap for body in bodies if body.gap is not None], 0.99, "m", none),
@@ -397,7 +404,7 @@ def outcome_to_json(room: RoomOutcome) -> dict[str, Any]:
 def outcome_from_json(document: dict[str, Any]) -> RoomOutcome:
     """Inverse of `outcome_to_json`, through JSON; raises KeyError and TypeError for anything else."""
     fixed = dict(document)
-    for name in ("wrong_support", "missing", "extra", "leaning", "problems"):
+    for name in ("wrong_support", "missing", "extra", "leaning", "fixed", "problems"):
         fixed[name] = tuple(fixed[name])
     fixed["models"] = tuple(ModelOutcome(**row) for row in fixed["models"])
     fixed["bodies"] = tuple(BodyOutcome(**row) for row in fixed["bodies"])

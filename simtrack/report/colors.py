@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping
 
 PALETTE = ("#4c9be8", "#f28e2b", "#59b36b", "#e0567a", "#b07aa1", "#17b3b3", "#d6a514", "#9c755f", "#7f8cff", "#8fb339")
 """Tableau-like hues of about equal lightness."""
+SHADES = (("#000000", 0.0), ("#000000", 0.38), ("#ffffff", 0.5))
+"""What the hues are mixed with, and its share, once they are used up."""
 ON, LEFT_OF, REFERENCE = "#ff3b30", "#20d5e8", "#ffd60a"
 """`on` red and `left-of` cyan as in the tracking paper's Fig. 4, and their reference."""
 UNKNOWN = "#ff3b30"
@@ -19,5 +21,17 @@ CSS_VARIABLES = {
 
 
 def class_colors(names: Iterable[str]) -> Mapping[str, str]:
-    """Class name -> colour, stable for the same set of names."""
-    return {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(sorted(set(names)))}
+    """Class name -> colour, stable for the same set of names; the first 30 differ."""
+    return {name: _color(i) for i, name in enumerate(sorted(set(names)))}
+
+
+def _color(number: int) -> str:
+    """The hues of `PALETTE` one after the other, then darker, then lighter."""
+    ground, share = SHADES[number // len(PALETTE) % len(SHADES)]
+    hue = PALETTE[number % len(PALETTE)]
+    mixed = ((1.0 - share) * _channel(hue, k) + share * _channel(ground, k) for k in range(3))
+    return "#" + "".join(f"{round(value):02x}" for value in mixed)
+
+
+def _channel(color: str, k: int) -> int:
+    return int(color[1 + 2 * k : 3 + 2 * k], 16)

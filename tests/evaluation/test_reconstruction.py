@@ -42,7 +42,7 @@ def room(name: str = "rooms:1", entities: str = "true", **changes: object) -> Ro
         models=(model("chair1"), model("chair2", seen=0.4, yaw=1.0, height=1.3)),
         bodies=(BodyOutcome("chair1", True, 0.001, 0.002), BodyOutcome("chair2", False, 0.003, None)),
         joints=(JointOutcome("door", True, 1.0, 0.05), JointOutcome("drawer", False, 1.0, 1.0)),
-        verdict="not plausible", problems=("problem: chair2: fell",), margin=0.001, agreement=0.5,
+        fixed=("board1",), verdict="not plausible", problems=("problem: chair2: fell",), margin=0.001, agreement=0.5,
         graph_seconds=1.0, seconds=10.0, cpu_seconds=9.0,
     )  # fmt: skip
     return replace(outcome, **changes)
@@ -119,14 +119,14 @@ def test_rooms_that_are_done_are_not_done_again(tmp_path: Path, monkeypatch: pyt
     tasks = [RoomTask(seed, False, "true", "graph") for seed in (1, 2)]
     ran: list[str] = []
 
-    def results(tasks: list[RoomTask], _workers: int):
+    def results(tasks: list[RoomTask], _run: object, _workers: int):
         for task in tasks:
             ran.append(task.room)
             yield task, room(task.room)
             if len(ran) == 1:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(reconstruction_rooms, "_results", results)
+    monkeypatch.setattr(reconstruction_rooms, "as_done", results)
     with pytest.raises(KeyboardInterrupt):
         evaluate_rooms(tasks, tmp_path, 1)
     told: list[tuple[int, int]] = []

@@ -40,6 +40,7 @@ def kinematic_tree(
     ground: float | None = None,
     parts: Mapping[str, str] | None = None,
     resting: Collection[str] = (),
+    fixed: Collection[str] = (),
 ) -> BodyTree:
     """The tree of a scene.
 
@@ -50,6 +51,7 @@ def kinematic_tree(
         ground: height in metres of a level ground that nobody saw; none if None.
         parts: entity -> part of its supporter's model that it stands on; the base if it is not told.
         resting: entities that rest on something, though the support that the graph guesses is far below.
+        fixed: entities that do not float, whatever they are.
     """
     of_entity = body_names(graph)
     taken = {*of_entity.values(), GROUND}
@@ -75,7 +77,8 @@ def kinematic_tree(
         grounded = ground is not None and graph.supports[entity].kind is SupportKind.ROOT
         if grounded:
             parent = bodies[1].name
-        kind: JointKind = "floating" if _floats(graph, entity, candidate, grounded, resting) else "fixed"
+        floats = entity not in fixed and _floats(graph, entity, candidate, grounded, resting)
+        kind: JointKind = "floating" if floats else "fixed"
         T_map_base = np.asarray(candidate.T_map_model, float)
         parent = links.get((graph.supports[entity].parent, (parts or {}).get(entity, "")), parent)
         joint = BodyJoint(f"{body_name}/{kind}", kind, parent, inverse(poses[parent]) @ T_map_base)

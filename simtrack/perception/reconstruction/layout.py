@@ -5,6 +5,7 @@ much of floor and wall. Doors and windows are closed by it, as far as collisions
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -34,6 +35,7 @@ class Slab:
     """(3,), unit: where the room is."""
 
 
+@lru_cache(maxsize=4096)
 def layout_slabs(graph: ContactGraph, name: str) -> tuple[Slab, ...]:
     """Slabs behind the planes of a layout node: those that support something and the main one.
 
@@ -64,12 +66,14 @@ def _footprints(graph: ContactGraph, name: str, plane: int) -> list[Float64]:
     return [corners - surface.distance(corners)[:, None] * surface.normal for corners in bottoms]
 
 
+@lru_cache(maxsize=2)
 def _middle(graph: ContactGraph) -> Float64:
     """(3,) middle of the boxes of all that is no layout; of all, if there is nothing else."""
     things = [node for node in graph.nodes.values() if not is_layout(node)] or list(graph.nodes.values())
     return np.mean([node.box.T_map_box[:3, 3] for node in things], axis=0)
 
 
+@lru_cache(maxsize=4096)
 def layout_mesh(node: EntityNode) -> Mesh | None:
     """The seen surface in the map, decimated; None for a node without a mesh."""
     if node.shape is None:

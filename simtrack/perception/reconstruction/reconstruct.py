@@ -9,21 +9,21 @@ stays as its own mesh, and a finding says so.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
 from simtrack.contracts import Float64
-from simtrack.errors import InvalidValueError, MeshError, UnknownNameError
+from simtrack.errors import MeshError, UnknownNameError
 from simtrack.objects.cad import CadModel, cad_classes, cad_models
 from simtrack.perception.reconstruction.body_tree import BodyTree
 from simtrack.perception.reconstruction.candidates import CadCandidate
-from simtrack.perception.reconstruction.kinematic_tree import body_names, kinematic_tree
+from simtrack.perception.reconstruction.kinematic_tree import kinematic_tree
 from simtrack.perception.reconstruction.own_model import is_own, own_candidate
-from simtrack.perception.reconstruction.selection import Rejection, Selection, SelectionConfig, select
-from simtrack.perception.reconstruction.settling import Settled, SettlingConfig, settle
-from simtrack.perception.reconstruction.snapping import Snapped, SnappingConfig, eq1_residuals, snap
+from simtrack.perception.reconstruction.resting import ReconstructionConfig, Rest, come_to_rest
+from simtrack.perception.reconstruction.selection import Rejection, Selection, select
+from simtrack.perception.reconstruction.snapping import Snapped, eq1_residuals
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_far_above, is_layout
 from simtrack.perception.scene_graph.contact.nodes import FLOOR, SCENE, EntityNode
 
@@ -61,7 +61,7 @@ class NoteCode(StrEnum):
     SHRUNK = "shrunk"
     """Its model is smaller than it was seen to be, so that it fits between the others."""
     UNSTABLE = "unstable"
-    """It would topple or slide far from where it was seen."""
+    """It would topple, slide or be pushed out of another one: it is fixed where it was seen."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,25 +72,6 @@ class Note:
     entity: str
     """Name, or empty for the scene."""
     message: str
-
-
-@dataclass(frozen=True, slots=True)
-class ReconstructionConfig:
-    """Settings of the stages; those of matching and alignment go with the shortlist."""
-
-    selection: SelectionConfig = field(default_factory=SelectionConfig)
-    snapping: SnappingConfig = field(default_factory=SnappingConfig)
-    settling: SettlingConfig = field(default_factory=SettlingConfig)
-    attempts: int = 4
-    """Selections that are tried until everything comes to rest."""
-    shrunk: tuple[float, ...] = (0.95, 0.9)
-    """Factors by which models are made smaller one after the other that are in others all the same."""
-
-    def __post_init__(self) -> None:
-        if self.attempts < 1:
-            raise InvalidValueError("ReconstructionConfig.attempts", self.attempts, "1 or more")
-        if not all(0.0 < factor <= 1.0 for factor in self.shrunk):
-            raise InvalidValueError("ReconstructionConfig.shrunk", self.shrunk, "factors in (0, 1]")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,93 +140,28 @@ def reconstruct(
         selection = select(graph, shortlists, config.selection)
     ground = _ground(graph, selection.chosen, notes)
     say("snapping and settling", 0.9)
-    attempt = _settled_attempt(graph, shortlists, selection, ground, config, name)
-    selection, snapped, chosen = attempt.selection, attempt.snapped, attempt.chosen
+    rest = come_to_rest(graph, shortlists, selection, config, ground)
+    selection, snapped, placed = rest.selection, rest.snapped, rest.placed
     _selection_notes(selection, notes)
     _held_notes(graph, snapped, notes)
     _snapping_notes(graph, snapped, notes)
-    _shrinking_notes(attempt, shortlists, notes)
-    _settling_notes(graph, attempt.settled, notes)
-    placed = _settled(graph, snapped.candidates, attempt.settled)
+    _shrinking_notes(rest, shortlists, notes)
+    _fixing_notes(rest, notes)
     say("kinematic tree", 0.98)
-    tree = kinematic_tree(name, graph, placed, ground, snapped.parts, snapped.resting)
+    tree = kinematic_tree(name, graph, placed, ground, snapped.parts, snapped.resting, rest.fixed)
     residuals = eq1_residuals(graph, placed, config.snapping)
     choices = {
         entity: Choice(
             candidate=placed[entity],
             rank=rank,
             offered=len(shortlists[entity]),
-            shift=placed[entity].T_map_model[:3, 3] - chosen[entity].T_map_model[:3, 3],
+            shift=placed[entity].T_map_model[:3, 3] - rest.chosen[entity].T_map_model[:3, 3],
             residual=residuals.get(entity, np.nan),
             rejected=tuple(selection.rejected.get(entity, ())),
         )
         for entity, rank in selection.chosen.items()
     }
     return Reconstruction(name, graph, choices, tree, tuple(notes))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Attempt:
-    """A selection, and how it comes to rest."""
-
-    selection: Selection
-    chosen: Mapping[str, CadCandidate]
-    snapped: Snapped
-    settled: Settled
-
-    @property
-    def unrest(self) -> tuple[int, float]:
-        """Number of bodies that do not come to rest out of each other, and how deep they are; the less, the better."""
-        return len({*self.settled.held, *self.settled.stuck}), sum(self.settled.stuck.values())
-
-
-def _settled_attempt(
-    graph: ContactGraph,
-    shortlists: Mapping[str, Sequence[CadCandidate]],
-    selection: Selection,
-    ground: float | None,
-    config: ReconstructionConfig,
-    name: str,
-) -> _Attempt:
-    """Snap and settle; what does not come to rest gets other candidates, as long as that helps."""
-    names = body_names(graph)
-    barred: dict[str, set[int]] = {}
-    attempts: list[_Attempt] = []
-
-    def attempt(selection: Selection, chosen: Mapping[str, CadCandidate]) -> _Attempt:
-        snapped = snap(graph, chosen, config.snapping, ground)
-        tree = kinematic_tree(name, graph, snapped.candidates, ground, snapped.parts, snapped.resting)
-        return _Attempt(selection, chosen, snapped, settle(tree, config.settling))
-
-    for _ in range(config.attempts):
-        chosen = {entity: shortlists[entity][rank] for entity, rank in selection.chosen.items()}
-        attempts.append(attempt(selection, chosen))
-        settled = attempts[-1].settled
-        restless = [e for e in chosen if names[e] in settled.held or names[e] in settled.stuck]
-        if not any(len(shortlists[entity]) > 1 for entity in restless):
-            break
-        for entity in restless:
-            barred.setdefault(entity, set()).add(selection.chosen[entity])
-        selection = select(graph, shortlists, config.selection, barred)
-    best = min(attempts, key=lambda made: made.unrest)
-    for factor in config.shrunk:
-        tight = [e for e in best.chosen if names[e] in best.settled.stuck and not is_own(best.chosen[e])]
-        if not tight:
-            break
-        smaller = {
-            e: replace(best.chosen[e], scale=factor * shortlists[e][best.selection.chosen[e]].scale) for e in tight
-        }
-        best = min(best, attempt(best.selection, {**best.chosen, **smaller}), key=lambda made: made.unrest)
-    return best
-
-
-def _settled(graph: ContactGraph, candidates: Mapping[str, CadCandidate], settled: Settled) -> dict[str, CadCandidate]:
-    """The candidates at the poses that their bodies settled at."""
-    names = body_names(graph)
-    return {
-        entity: replace(candidate, T_map_model=settled.poses.get(names[entity], candidate.T_map_model))
-        for entity, candidate in candidates.items()
-    }
 
 
 def _default_shortlist() -> Shortlist:
@@ -357,9 +273,9 @@ def _ground(graph: ContactGraph, chosen: Collection[str], notes: list[Note]) -> 
     return height
 
 
-def _shrinking_notes(attempt: _Attempt, shortlists: Mapping[str, Sequence[CadCandidate]], notes: list[Note]) -> None:
-    for name, rank in attempt.selection.chosen.items():
-        share = attempt.chosen[name].scale / shortlists[name][rank].scale
+def _shrinking_notes(rest: Rest, shortlists: Mapping[str, Sequence[CadCandidate]], notes: list[Note]) -> None:
+    for name, rank in rest.selection.chosen.items():
+        share = rest.chosen[name].scale / shortlists[name][rank].scale
         if share < 1.0:
             message = (
                 f"is made {100.0 * (1.0 - share):.0f} % smaller than it was seen to be: it would not fit in its place"
@@ -376,14 +292,6 @@ def _snapping_notes(graph: ContactGraph, snapped: Snapped, notes: list[Note]) ->
         notes.append(Note(NoteCode.INTERPENETRATING, first, message))
 
 
-def _settling_notes(graph: ContactGraph, settled: Settled, notes: list[Note]) -> None:
-    for entity, body in body_names(graph).items():
-        if body in settled.stuck:
-            depth = 1e3 * settled.stuck[body]
-            notes.append(Note(NoteCode.INTERPENETRATING, entity, f"is still {depth:.1f} mm deep in another at rest"))
-        if body in settled.held:
-            motion = settled.held[body]
-            went = f"{1e3 * motion.shift:.0f} mm and turn by {np.degrees(motion.turn):.0f} degrees"
-            notes.append(
-                Note(NoteCode.UNSTABLE, entity, f"it would go {went} before it rests; it is left in its place")
-            )
+def _fixing_notes(rest: Rest, notes: list[Note]) -> None:
+    for name, trouble in rest.fixed.items():
+        notes.append(Note(NoteCode.UNSTABLE, name, f"finds no rest: it {trouble}; it is fixed where it was seen"))

@@ -29,6 +29,8 @@ CLEAR = 0.9
 """Share of its height that has to be free above a face: boards and drawers are thin, and take little of it."""
 MOST_TAKEN = 0.15
 """Share of it that the model may take."""
+SAME_WAY = float(np.cos(np.radians(30.0)))
+"""Cosine between the up-axes of models that lie on the same side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +113,7 @@ def select(
     config = config or SelectionConfig()
     out = Selection()
     solids = {name: [solid_of(candidate) for candidate in found] for name, found in shortlists.items() if found}
-    layout = _upright_layout(graph)
+    layout = _Layout(graph)
     kept = {name: _kept(graph, name, shortlists[name], solids[name], layout, config, out) for name in solids}
     kept = {name: _well_aligned(name, ranks, shortlists[name], config, out) for name, ranks in kept.items()}
     for name, ranks in (barred or {}).items():
@@ -138,7 +140,7 @@ def _kept(
     name: str,
     candidates: Sequence[CadCandidate],
     solids: Sequence[Solid],
-    layout: Sequence[tuple[Solid, Float64]],
+    layout: "_Layout",
     config: SelectionConfig,
     out: Selection,
 ) -> list[int]:
@@ -157,7 +159,7 @@ def _kept(
         [c for c in lost if place_of(y, solid, graph, c, config.far, config.weak_area, config.aside) is None]
         for (y, solid), lost in zip(pairs, dropped, strict=True)
     ]
-    depths = [max((depth_along(solid, slab, normal) for slab, normal in layout), default=0.0) for solid in solids]
+    depths = [layout.depth(solid) for solid in solids]
     fewest = min(len(names) for names in homeless)
     able = [k for k, names in enumerate(homeless) if len(names) == fewest]
     least = max(min(depths[k] for k in able), config.wall_depth)
@@ -179,18 +181,33 @@ def _kept(
 def _well_aligned(
     name: str, ranks: Sequence[int], candidates: Sequence[CadCandidate], config: SelectionConfig, out: Selection
 ) -> list[int]:
-    """Those of the ranks that are not far worse aligned than the best: a book on its edge does not lie down for a push.
+    """Those of the ranks that are not far worse aligned than the best, and lie on the same side as the first.
 
-    Its own mesh counts as well aligned.
+    A book on its edge does not lie down for a push, nor does a bottle stand on its head. Its own mesh counts as well
+    aligned.
     """
     errors = {rank: 0.0 if is_own(candidates[rank]) else candidates[rank].alignment_error for rank in ranks}
     models = [rank for rank in ranks if not is_own(candidates[rank])]
     least = min((errors[rank] for rank in models), default=0.0)
     good = [rank for rank in ranks if errors[rank] <= config.far_worse * least + config.slack]
-    for rank in set(ranks) - set(good):
-        reason = f"is aligned far worse, AE {1e3 * errors[rank]:.0f} mm and not {1e3 * least:.0f} mm"
+    reasons = {
+        rank: f"is aligned far worse, AE {1e3 * errors[rank]:.0f} mm and not {1e3 * least:.0f} mm"
+        for rank in ranks
+        if rank not in good
+    }
+    best = candidates[min((rank for rank in good if rank in models), default=ranks[0])]
+    turned = [rank for rank in good if not is_own(candidates[rank]) and not _same_way_up(candidates[rank], best)]
+    reasons |= dict.fromkeys(turned, "lies on another side than the one that is aligned best")
+    for rank, reason in reasons.items():
         out.rejected.setdefault(name, []).append(Rejection(rank, candidates[rank].model.name, reason))
-    return good
+    return [rank for rank in good if rank not in turned]
+
+
+def _same_way_up(first: CadCandidate, second: CadCandidate) -> bool:
+    """Whether two models lie on the same side; what does not stand upright may lie on either of its faces."""
+    cosine = float(first.T_map_model[:3, 2] @ second.T_map_model[:3, 2])
+    tipped = abs(float(second.T_map_model[2, 2])) < SAME_WAY
+    return (abs(cosine) if tipped else cosine) > SAME_WAY
 
 
 def place_of(
@@ -288,10 +305,22 @@ def _rectangle(T: Float64, size: Float64) -> Float64:
     return corners @ T[:2, :2].T + T[:2, 3]
 
 
-def _upright_layout(graph: ContactGraph) -> list[tuple[Solid, Float64]]:
-    """Slabs, and where the room is (3,), of walls and ceilings; floors are a matter of support."""
-    names = [node.name for node in graph.nodes.values() if is_layout(node) and node.semantic_class != FLOOR]
-    return [(Solid.of([slab.mesh.vertices]), slab.normal) for name in names for slab in layout_slabs(graph, name)]
+class _Layout:
+    """Slabs of walls and ceilings; floors are a matter of support."""
+
+    def __init__(self, graph: ContactGraph) -> None:
+        names = [node.name for node in graph.nodes.values() if is_layout(node) and node.semantic_class != FLOOR]
+        slabs = [slab for name in names for slab in layout_slabs(graph, name)]
+        self._solids = [Solid.of([slab.mesh.vertices]) for slab in slabs]
+        self._normals = [slab.normal for slab in slabs]
+        self._low = np.array([solid.low[0] for solid in self._solids]).reshape(-1, 3)
+        self._high = np.array([solid.high[0] for solid in self._solids]).reshape(-1, 3)
+
+    def depth(self, solid: Solid) -> float:
+        """How deep a solid stands in any of them, metres."""
+        low, high = solid.low.min(axis=0), solid.high.max(axis=0)
+        near = np.flatnonzero((np.maximum(low - self._high, self._low - high) < 0.0).all(axis=1))
+        return max((depth_along(solid, self._solids[k], self._normals[k]) for k in near), default=0.0)
 
 
 # --------------------------------------------------------------------------------------------------------------- search
@@ -304,14 +333,15 @@ class _Conflicts:
         self.solids = solids
         self.limit = config.overlap_depth
         self.names = list(solids)
-        boxes = {n: (np.min([s.low.min(0) for s in found], 0), np.max([s.high.max(0) for s in found], 0))
-                 for n, found in solids.items()}  # fmt: skip
+        low = np.array([np.min([s.low.min(0) for s in found], 0) for found in solids.values()]).reshape(-1, 3)
+        high = np.array([np.max([s.high.max(0) for s in found], 0) for found in solids.values()]).reshape(-1, 3)
+        supporters = {name: {*graph.supporters(name)} for name in self.names}
         self.near = {name: [] for name in self.names}
         for i, a in enumerate(self.names):
-            for b in self.names[i + 1 :]:
-                related = b in graph.supporters(a) or a in graph.supporters(b)
-                apart = (np.maximum(boxes[a][0] - boxes[b][1], boxes[b][0] - boxes[a][1]) > 0.0).any()
-                if not related and not apart:
+            close = (np.maximum(low[i] - high[i + 1 :], low[i + 1 :] - high[i]) <= 0.0).all(axis=1)
+            for j in np.flatnonzero(close).tolist():
+                b = self.names[i + 1 + j]
+                if b not in supporters[a] and a not in supporters[b]:
                     self.near[a].append(b)
                     self.near[b].append(a)
         self._known: dict[tuple[str, int, str, int], tuple[float, float]] = {}

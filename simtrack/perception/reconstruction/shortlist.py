@@ -9,6 +9,7 @@ at whether the front could be used.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.boxes import OrientedBox
 from simtrack.geometry.meshes import face_areas, face_normals
+from simtrack.geometry.transforms import apply
 from simtrack.geometry.upright_boxes import MIN_SIDE
 from simtrack.objects.cad import CadModel
 from simtrack.perception.reconstruction.alignment import AlignmentConfig
@@ -27,6 +29,8 @@ from simtrack.perception.scene_graph.contact import ContactGraph, EntityKind, En
 
 _WALL_AREA = 0.5
 """Square metres of the planes that count as walls."""
+FACING_THE_ROOM = {"monitor": 0.5, "sofa": 0.5}
+"""Class of what is looked at or sat on from its front -> metres that its front needs to a wall."""
 _UNSEEN_SIDES = 2
 """Sides of the box that may not have been seen of what is believed to lie."""
 _FLAT = 0.3
@@ -43,24 +47,27 @@ class ShortlistConfig:
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     upright: int = 40
     """Upright matches of lowest ME that are aligned coarsely."""
-    tipped: int = 3
-    """Other matches of lowest ME, likewise."""
+    tipped: int = 12
+    """Other matches of lowest ME, likewise: ME ranks what lies by planes that a thin thing hardly has."""
     advantage: float = 0.4
     """Share of the best upright candidate's error below which a tipped one goes before it: things stand as they are
     made to."""
     blocked_front: float = 1.5
-    """Factor on the error of an articulated candidate whose front faces a wall: nobody could open it."""
+    """Factor on the error of a candidate whose front faces a wall, if it is articulated or one of `FACING_THE_ROOM`:
+    nobody could open it, or look at it."""
     access: float = 0.3
-    """Metres that a front needs to a wall."""
+    """Metres that the front of what is articulated needs to a wall."""
     unseen_front: float = 0.3
     """Factor, added to 1, on the error of an articulated candidate whose front nobody saw where its rear was seen:
     rears stand against walls."""
+    natural_size: float = 0.25
+    """What a scale that is off by a factor of e adds to the error, relative to it: things have their usual sizes."""
     opened: int = 3
     """Candidates of articulated models for which open positions of the joints are tried; all of them where the smallest
     box is not that of the carcass: something stands open."""
 
     def __post_init__(self) -> None:
-        for name in ("upright", "tipped", "opened", "access", "unseen_front"):
+        for name in ("upright", "tipped", "opened", "access", "unseen_front", "natural_size"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InvalidValueError(f"ShortlistConfig.{name}", getattr(self, name), "0 or more")
         if not 0.0 < self.advantage <= 1.0 or not 1.0 <= self.blocked_front < np.inf:
@@ -163,14 +170,18 @@ def ranking_error(fit: Fit, view: EntityView, free: Float64, config: ShortlistCo
         free: (4,) metres from each of `SIDES` to a wall.
         config: the factors.
     """
-    error = fit.error
+    error = fit.error * (1.0 + config.natural_size * abs(float(fit.unknowns[0])))
     if fit.match.orientation not in UPRIGHT:
         return error / config.advantage
-    if not fit.match.model.articulated:
+    model = fit.match.model
+    if not (model.articulated or model.semantic_class in FACING_THE_ROOM):
         return error
     side = int(np.argmax(SIDES @ -fit.T_box_model[:2, 1]))
-    if free[side] < config.access <= free[(side + 2) % 4]:
+    access = config.access if model.articulated else FACING_THE_ROOM[model.semantic_class]
+    if free[side] < access <= free[(side + 2) % 4]:
         error *= config.blocked_front
+    if not model.articulated:
+        return error
     front, rear = view.facing_sides[side], view.facing_sides[(side + 2) % 4]
     return error * (1.0 + config.unseen_front * max(0.0, rear - front) / max(rear + front, 1e-9))
 
@@ -181,20 +192,41 @@ def front_clearances(view: EntityView, graph: ContactGraph) -> Float64:
     directions = np.column_stack([SIDES, np.zeros(4)]) @ T[:3, :3].T
     middles = T[:3, 3] + (np.abs(SIDES) @ half[:2])[:, None] * directions
     free = np.full(4, np.inf)
-    for wall in graph.nodes.values():
-        if wall.kind is not EntityKind.LAYOUT or wall.shape is None:
-            continue
-        for plane, outline in zip(wall.planes, wall.shape.outlines, strict=False):
-            facing = np.flatnonzero((directions @ plane.normal < -0.7) & (plane.area > _WALL_AREA))
-            for side in facing if abs(plane.normal[2]) < 0.1 else ():
-                distance = float(plane.distance(middles[side]))
-                at = middles[side] - distance * plane.normal
-                corners = outline @ wall.T_map_entity[:3, :3].T + wall.T_map_entity[:3, 3]
-                if (at[:2] >= corners[:, :2].min(axis=0) - 0.05).all() and (
-                    at[:2] <= corners[:, :2].max(axis=0) + 0.05
-                ).all():
-                    free[side] = min(free[side], max(distance, 0.0))
+    walls = _wall_planes(graph)
+    facing = directions @ walls.normals.T < -0.7
+    distances = middles @ walls.normals.T + walls.offsets
+    for side, wall in np.argwhere(facing).tolist():
+        at = (middles[side] - distances[side, wall] * walls.normals[wall])[:2]
+        if (at >= walls.low[wall] - 0.05).all() and (at <= walls.high[wall] + 0.05).all():
+            free[side] = min(free[side], max(float(distances[side, wall]), 0.0))
     return free
+
+
+@dataclass(frozen=True, slots=True)
+class _WallPlanes:
+    """Upright planes of layout: (N, 3) normals, (N,) offsets, (N, 2) lower and upper corners of x, y."""
+
+    normals: Float64
+    offsets: Float64
+    low: Float64
+    high: Float64
+
+
+@lru_cache(maxsize=2)
+def _wall_planes(graph: ContactGraph) -> _WallPlanes:
+    found = [
+        (plane, apply(wall.T_map_entity, outline)[:, :2])
+        for wall in graph.nodes.values()
+        if wall.kind is EntityKind.LAYOUT and wall.shape is not None
+        for plane, outline in zip(wall.planes, wall.shape.outlines, strict=False)
+        if abs(plane.normal[2]) < 0.1 and plane.area > _WALL_AREA
+    ]
+    return _WallPlanes(
+        np.array([plane.normal for plane, _ in found]).reshape(-1, 3),
+        np.array([plane.offset for plane, _ in found]),
+        np.array([corners.min(axis=0) for _, corners in found]).reshape(-1, 2),
+        np.array([corners.max(axis=0) for _, corners in found]).reshape(-1, 2),
+    )
 
 
 def _candidate(view: EntityView, fit: Fit, T_back: Float64) -> CadCandidate:

@@ -129,6 +129,37 @@ def test_a_model_that_does_not_fit_is_made_smaller_and_that_is_said() -> None:
     assert kept.choices["tin"].candidate.scale == 1.0
 
 
+def test_what_finds_no_rest_is_fixed_where_it_was_seen_and_that_is_said() -> None:
+    """A thin board upright on its edge, and a tin that stands well."""
+    made = scene(
+        board=("sheet", block((0.3, 0.008, 0.4), (0.0, 0.0, 0.0))), tin=("tin", block((0.1, 0.1, 0.1), (1.0, 0.0, 0.0)))
+    )
+    joints = {body.name: body.joint.kind for body in made.tree.bodies if body.joint is not None}
+    assert (joints["board"], joints["tin"]) == ("fixed", "floating")
+    said = {note.entity: note.message for note in made.notes if note.code is NoteCode.UNSTABLE}
+    assert list(said) == ["board"]
+    assert "fixed where it was seen" in said["board"]
+    assert np.abs(made.choices["board"].shift).max() < 1e-3
+
+
+def test_what_finds_no_rest_gets_another_candidate_that_does() -> None:
+    """A post whose first model stands on a pin, and whose second one on all of its bottom."""
+    graph = corner(post=("post", block((0.1, 0.1, 0.4), (0.0, 0.0, 0.0))))
+    models = []
+    for foot in (0.004, 0.05):
+        builder = ModelBuilder("post", f"post on a foot of {foot} m")
+        part = builder.part()
+        part.block((-foot, -foot, 0.0), (foot, foot, 0.02), OAK)
+        part.block((-0.05, -0.05, 0.02), (0.05, 0.05, 0.4), OAK)
+        models.append(builder.finish(f"post-{foot}"))
+    offered = [CadCandidate(model, at(0.0, 0.0, 0.2), 1.0) for model in models]
+    made = reconstruct(graph, known={"post": offered})
+    assert made.choices["post"].rank == 1
+    assert NoteCode.UNSTABLE not in {note.code for note in made.notes}
+    only = reconstruct(graph, known={"post": offered[:1]})
+    assert [note.entity for note in only.notes if note.code is NoteCode.UNSTABLE] == ["post"]
+
+
 def test_the_floor_goes_on_under_what_stands_on_it() -> None:
     part = EntityMesh("floor", "floor", block((2.0, 2.0, 0.02), (0.0, 0.0, -0.02)))
     crate = EntityMesh("crate", "crate", block((0.5, 0.5, 0.4), (1.1, 0.0, 0.0)))

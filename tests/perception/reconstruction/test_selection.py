@@ -1,10 +1,12 @@
 """Global check: what cannot carry, stands in a wall or in others, is not taken."""
 
+import numpy as np
 import pytest
 from corner import at, block, corner, table_mesh, table_model
 
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.meshes import concatenate
+from simtrack.geometry.transforms import exp_so3, transform
 from simtrack.objects.cad.builder import ModelBuilder
 from simtrack.objects.cad.materials import OAK
 from simtrack.perception.reconstruction.candidates import CadCandidate
@@ -94,6 +96,26 @@ def test_a_candidate_that_is_aligned_far_worse_is_not_taken_to_keep_out_of_other
     assert selection.chosen == {"first": 0, "second": 0}
     assert [(r.rank, "far worse" in r.reason) for r in selection.rejected["first"]] == [(1, True)]
     assert select(graph, offered, SelectionConfig(far_worse=30.0)).chosen["first"] == 1
+
+
+@pytest.mark.parametrize("tipped", [False, True])
+def test_a_bottle_does_not_stand_on_its_head_to_keep_out_of_others(tipped: bool) -> None:
+    """What lies on a side may be turned to the opposite one; what stands stays upright."""
+    graph = corner(
+        first=("table", table_mesh((0.9, 0.6, 0.7), (-0.5, 0.0, 0.0))),
+        second=("table", table_mesh((0.9, 0.6, 0.7), (0.5, 0.0, 0.0))),
+    )
+    side = transform(exp_so3(np.array([np.pi / 2, 0.0, 0.0]))) if tipped else np.eye(4)
+    over = transform(exp_so3(np.array([0.0, 0.0, np.pi]) if tipped else np.array([np.pi, 0.0, 0.0])))
+    offered = {
+        "first": [CadCandidate(WIDE, at(-0.45, 0.0, 0.35) @ side, 1.0),
+                  CadCandidate(WIDE, at(-0.55, 0.0, 0.35) @ over @ side, 1.0)],
+        "second": [CadCandidate(WIDE, at(0.45, 0.0, 0.35) @ side, 1.0)],
+    }  # fmt: skip
+    selection = select(graph, offered)
+    assert selection.chosen["first"] == (1 if tipped else 0)
+    reasons = [r.reason for r in selection.rejected.get("first", ())]
+    assert any("another side" in reason for reason in reasons) != tipped
 
 
 def test_what_is_taller_than_the_room_above_a_board_has_no_place_there() -> None:

@@ -81,6 +81,23 @@ def test_what_would_topple_is_held_and_reported_and_carries_what_stands_on_it() 
     assert settled.poses["box"][2, 3] == pytest.approx(SIDE / 2, abs=5e-4)
 
 
+def test_what_stands_on_a_narrow_edge_is_wobbly_and_stays_where_it_rests() -> None:
+    """A plate falls at a tilt of atan(thickness / height): 1.4 deg for the thin one, 5.7 deg for the other."""
+    thin, thick = (
+        thing(name, (0.2, width, 0.4), transform(None, (x, 0.0, 0.2)))
+        for name, width, x in (("thin", 0.01, 0.0), ("thick", 0.04, 0.5))
+    )
+    settled = settle(tree(thin, thick))
+    assert settled.held == settled.stuck == {}
+    assert set(settled.wobbly) == set(settled.restless) == {"thin"}
+    assert settled.wobbly["thin"] > SettlingConfig().wobble
+    assert "tilted" in settled.trouble("thin")
+    for name, body in (("thin", thin), ("thick", thick)):
+        assert body.joint is not None
+        np.testing.assert_array_equal(settled.poses[name], body.joint.T_parent_body)
+    assert settle(tree(thin, thick), SettlingConfig(tilt=0.0)).wobbly == {}
+
+
 def test_joints_keep_their_position() -> None:
     """A lid that stands open upright on a box that drops does not close."""
     box = thing("box", CUBE, transform(None, (0.0, 0.0, SIDE / 2 + 0.01)))
@@ -93,7 +110,9 @@ def test_joints_keep_their_position() -> None:
     np.testing.assert_allclose(settled.poses["box"], transform(None, (0.0, 0.0, SIDE / 2)), atol=5e-4)
 
 
-@pytest.mark.parametrize("field", [{"shift": 0.0}, {"turn": float("nan")}, {"friction": 1.5}, {"rounds": -1}])
+@pytest.mark.parametrize(
+    "field", [{"shift": 0.0}, {"turn": float("nan")}, {"friction": 1.5}, {"rounds": -1}, {"tilt": 1.0}]
+)
 def test_settings_out_of_range_are_refused(field: dict) -> None:
     with pytest.raises(InvalidValueError, match=next(iter(field))):
         SettlingConfig(**field)

@@ -4,8 +4,8 @@ import itertools
 
 import numpy as np
 
-from simtrack.objects.cad.builder import ModelBuilder
-from simtrack.objects.cad.designs.pieces import GAP, bar, carcass, door, drawer, round_legs, square_legs
+from simtrack.objects.cad.builder import ModelBuilder, PartBuilder
+from simtrack.objects.cad.designs.pieces import GAP, Span, bar, carcass, door, drawer, round_legs, square_legs
 from simtrack.objects.cad.materials import (
     APPLIANCE,
     BLACK_STEEL,
@@ -62,9 +62,10 @@ def sideboard() -> ModelBuilder:
     p, x, y, z, h = b.part(), 0.75, 0.2, 0.16, 0.7
     round_legs(p, (2 * x - 0.12, 2 * y - 0.06), z, 0.018, BLACK_STEEL)
     carcass(p, (-x, x), (-y, y), (z, h), 0.02, WALNUT)
-    for s in (-1, 1):
-        p.block((s * 0.26, -y, z + 0.02), (s * 0.24, y - 0.02, h - 0.02), WALNUT)
-        b.hollow(p, (s * 0.26, -y, z + 0.02), (s * (x - 0.02), y - 0.02, h - 0.02))
+    for left, right in ((-x + 0.02, -0.26), (0.26, x - 0.02)):
+        b.hollow(p, (left, -y, z + 0.02), (right, y - 0.02, h - 0.02))
+    for left, right in ((-0.26, -0.24), (0.24, 0.26)):
+        p.block((left, -y, z + 0.02), (right, y - 0.02, h - 0.02), WALNUT)
     b.hollow(p, (-0.24, -y, z + 0.02), (0.24, y - 0.02, h - 0.02))
     b.support(p, (0.0, 0.0, h), (2 * x, 2 * y))
     door(b, "left-door", (-x, -0.25), (z, h), -y, "left", WALNUT)
@@ -173,6 +174,38 @@ def wall_pair() -> ModelBuilder:
     door(b, "left-door", (-x, 0.0), (0.0, h), -y, "left", OAK, grip=(0.05, 0.2))
     door(b, "right-door", (0.0, x), (0.0, h), -y, "right", OAK, grip=(0.05, 0.2))
     return b
+
+
+def base_unit() -> ModelBuilder:
+    """Stands under a worktop: one door as high as the unit before a shelf, sides down to the floor."""
+    b = ModelBuilder("cabinet", "base unit with one door and a shelf")
+    p, x, y, h = b.part(), 0.3, 0.28, 0.87
+    for left in (-x, x - 0.018):
+        p.block((left, -y + 0.05, 0.0), (left + 0.018, y, 0.1), GREY_BOARD)
+    _shelved(b, p, x, y, (0.1, h), 0.48)
+    door(b, "door", (-x, x), (0.1, h), -y, "right", GREY_BOARD, thickness=0.018, grip=(0.6, 0.75))
+    return b
+
+
+def base_pair() -> ModelBuilder:
+    """Stands under a worktop: two doors before a shelf, on a closed plinth."""
+    b = ModelBuilder("cabinet", "base unit with two doors and a shelf")
+    p, x, y, h = b.part(), 0.5, 0.28, 0.9
+    p.block((-x + 0.01, -y + 0.04, 0.0), (x - 0.01, y, 0.12), WHITE_BOARD)
+    _shelved(b, p, x, y, (0.12, h), 0.52)
+    door(b, "left-door", (-x, 0.0), (0.12, h), -y, "left", OAK, thickness=0.018, grip=(0.65, 0.8))
+    door(b, "right-door", (0.0, x), (0.12, h), -y, "right", OAK, thickness=0.018, grip=(0.65, 0.8))
+    return b
+
+
+def _shelved(b: ModelBuilder, p: PartBuilder, x: float, y: float, z: Span, shelf: float) -> None:
+    """A carcass of boards with one shelf, things to stand on it, below it and on top."""
+    low, high, wall = *z, 0.018
+    carcass(p, (-x, x), (-y, y), z, wall, WHITE_BOARD)
+    p.block((-x + wall, -y + 0.02, shelf), (x - wall, y - wall, shelf + wall), WHITE_BOARD)
+    b.hollow(p, (-x + wall, -y, low + wall), (x - wall, y - wall, shelf))
+    b.hollow(p, (-x + wall, -y + 0.02, shelf + wall), (x - wall, y - wall, high - wall))
+    b.support(p, (0.0, 0.0, high), (2 * x, 2 * y))
 
 
 # ------------------------------------------------------------------------------------------------------------ fridges
@@ -324,7 +357,20 @@ MICROWAVES = {
 }
 """Name -> design."""
 
-CABINETS = (wardrobe, chest, sideboard, bookcase, night_stand, filing, vitrine, locker, wall_unit, wall_pair)
+CABINETS = (
+    wardrobe,
+    chest,
+    sideboard,
+    bookcase,
+    night_stand,
+    filing,
+    vitrine,
+    locker,
+    wall_unit,
+    wall_pair,
+    base_unit,
+    base_pair,
+)
 FRIDGES = (
     single_door,
     freezer_below,

@@ -155,7 +155,7 @@ def _touching(
     contacts: dict[str, SupportOption] = {}
     for parent, pair in found.items():
         options = [o for o in _direct(pair) if abs(o.distance) <= config.contact_gap]
-        if options:
+        if options and not _rests(parent, name, evidence, config):  # nothing stands on what stands in it
             contacts[parent] = max(options, key=lambda option: option.score)
     seated = {parent for parent, option in contacts.items() if option.area >= config.contact_area}
     hidden_by = {p for p in contacts if _hidden(p, child, contacts, seated, evidence, config)}
