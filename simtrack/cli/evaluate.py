@@ -2,43 +2,63 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+if TYPE_CHECKING:
+    from simtrack.perception.mapping.panoptic.panoptic_map import Method
+
 
 def evaluate(
-    what: Annotated[Literal["reconstruction", "detector"], tyro.conf.Positional],
+    what: Annotated[Literal["reconstruction", "panoptic", "detector"], tyro.conf.Positional],
     rooms: str = "all",
     entities: Literal["true", "partial", "both"] = "both",
     stages: Literal["graph", "models", "physics"] = "physics",
+    method: Literal["full", "no-joint-fusion", "voxbloxpp", "all"] = "all",
+    strength: float = 1.0,
+    frames: int = 300,
+    voxel: float = 0.02,
     out: Path = Path("reports"),
-    work: Path = Path("runs/evaluate-reconstruction"),
+    work: Path | None = None,
     workers: int | None = None,
     data: Path | None = None,
     detector: str = "keypoints",
     count: int | None = None,
 ) -> int:
-    """Measure a part against the truth: reconstruction of many rooms, or the detector on labelled images.
+    """Measure a part against the truth: reconstruction or maps of many rooms, or the detector on labelled images.
 
-    Reconstruction: contact graph, CAD models, physics. The same command carries on where a stopped one was; rooms that
-    the same code has done are not done again.
+    Of rooms, the same command carries on where a stopped one was; those that the same code has done are not done again.
 
     Args:
-        what: What is evaluated.
-        rooms: Reconstruction: all evaluation rooms, or some: 101,102 or 1-20 or kitchen:2.
-        entities: Complete meshes, or partial ones as a camera sees them on a walk, or both.
-        stages: How far to go: the contact graph alone, CAD models too, or the check of physics as well.
+        what: reconstruction: contact graph, CAD models, physics; panoptic: maps of filmed rooms; detector: boxes,
+            keypoints and poses.
+        rooms: all evaluation rooms, or some: 101,102 or 1-20 or kitchen:2.
+        entities: Of a reconstruction: complete meshes, partial ones as a camera sees them on a walk, or both.
+        stages: Of a reconstruction: the contact graph alone, CAD models too, or the check of physics as well.
+        method: Of a map: full, one of those that it is compared with, or all of them.
+        strength: Of the errors of the oracle that segments the images, 0 to 3.
+        frames: Of each room's film.
+        voxel: Metres, of the maps.
         out: Folder for the results, WHAT.json and WHAT.txt.
-        work: Folder where rooms are kept as they are done.
-        workers: Processes; one a core if not given.
+        work: Folder where rooms are kept as they are done; runs/evaluate-WHAT if not given.
+        workers: Processes of a reconstruction; one a core if not given. Maps are made one after the other.
         data: Detector: folder of a generated data set with the format bop that it was not trained on.
         detector: keypoints (the networks that come along), or a folder that `simtrack train detector` wrote.
-        count: Images at most.
+        count: Detector: images at most.
     """
+    from simtrack.errors import InvalidValueError
+
+    if workers is not None and workers < 1:
+        raise InvalidValueError("workers", workers, "1 or more")
+    if out.exists() and not out.is_dir():
+        raise InvalidValueError("out", str(out), "a folder, but this is a file")
+    folder = work if work is not None else Path("runs") / f"evaluate-{what}"
     if what == "detector":
         return _detector(data, detector, count, out)
-    return _reconstruction(rooms, entities, stages, out, work, workers)
+    if what == "panoptic":
+        return _panoptic(rooms, method, strength, frames, voxel, out, folder)
+    return _reconstruction(rooms, entities, stages, out, folder, workers)
 
 
 def _detector(data: Path | None, detector: str, count: int | None, out: Path) -> int:
@@ -65,6 +85,42 @@ def _detector(data: Path | None, detector: str, count: int | None, out: Path) ->
     return 0
 
 
+def _panoptic(
+    rooms: str, method: "Method | Literal['all']", strength: float, frames: int, voxel: float, out: Path, work: Path
+) -> int:
+    from simtrack.cli import console
+    from simtrack.errors import InvalidValueError
+    from simtrack.evaluation.panoptic_rooms import RoomMapTask, evaluate_maps, summed, tables_of, write_panoptic
+    from simtrack.evaluation.reconstruction_rooms import parse_rooms
+    from simtrack.perception.mapping.panoptic.panoptic_map import METHODS
+    from simtrack.perception.mapping.panoptic.volume import VolumeConfig
+    from simtrack.simulation.building.rooms.film import FilmConfig
+
+    if not 0.0 <= strength <= 3.0:
+        raise InvalidValueError("strength", strength, "0 to 3")
+    FilmConfig(frames=frames)  # refuse bad values before hours of work
+    VolumeConfig(voxel=voxel)
+    methods = METHODS if method == "all" else (method,)
+    tasks = [RoomMapTask(seed, kitchen, methods, strength, frames, voxel) for seed, kitchen in parse_rooms(rooms)]
+    with console.ProgressLine("evaluate panoptic", "looking for rooms that are done") as line:
+        try:
+            done, failed = evaluate_maps(tasks, work, line.show)
+        except KeyboardInterrupt:
+            console.show_error("stopped: rooms that are done are kept, and the same command carries on")
+            return 130
+    for room, reason in failed:
+        console.show_error(f"{room} could not be mapped: {reason}")
+    if not done:
+        return 2
+    total = {name: summed([results[name] for results in done.values()]) for name in methods}
+    for title, (columns, rows) in tables_of(done, total).items():
+        if rows:
+            print(title)
+            console.show_table(columns, rows, right=range(1, len(columns)))
+    console.show_written(out, write_panoptic(done, out))
+    return 2 if failed else 0
+
+
 def _reconstruction(
     rooms: str,
     entities: Literal["true", "partial", "both"],
@@ -74,7 +130,6 @@ def _reconstruction(
     workers: int | None,
 ) -> int:
     from simtrack.cli import console
-    from simtrack.errors import InvalidValueError
     from simtrack.evaluation.reconstruction import ENTITIES
     from simtrack.evaluation.reconstruction_rooms import (
         RoomTask,
@@ -85,10 +140,6 @@ def _reconstruction(
         write_results,
     )
 
-    if workers is not None and workers < 1:
-        raise InvalidValueError("workers", workers, "1 or more")
-    if out.exists() and not out.is_dir():
-        raise InvalidValueError("out", str(out), "a folder, but this is a file")
     kinds = ENTITIES if entities == "both" else (entities,)
     tasks = [RoomTask(seed, kitchen, kind, stages) for seed, kitchen in parse_rooms(rooms) for kind in kinds]
     size = min(workers or len(os.sched_getaffinity(0)), len(tasks))

@@ -15,6 +15,7 @@ from simtrack.cli.env import env
 from simtrack.cli.evaluate import evaluate
 from simtrack.cli.generate import generate
 from simtrack.cli.inspect import inspect
+from simtrack.cli.map import map_command
 from simtrack.cli.objects import objects
 from simtrack.cli.query import query
 from simtrack.cli.reconstruct import reconstruct
@@ -40,6 +41,7 @@ VERBS = {
     "inspect": inspect,
     "validate": validate,
     "train": train,
+    "map": map_command,
     "reconstruct": reconstruct,
     "check": check,
     "scenes": scenes,

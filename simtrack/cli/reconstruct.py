@@ -1,9 +1,6 @@
 """``simtrack reconstruct``: make a functional scene of entities, and check whether it is physically plausible."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from shutil import rmtree
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
@@ -24,7 +21,7 @@ FOLDERS = ("meshes",)
 def reconstruct(
     source: Annotated[str, tyro.conf.Positional],
     out: Path | None = None,
-    entities: Literal["true", "partial", "tracked"] | None = None,
+    entities: Literal["true", "partial", "tracked", "mapped"] | None = None,
     seed: int = 0,
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     time_limit: float = 300.0,
@@ -34,15 +31,16 @@ def reconstruct(
     Ends with exit code 0 if the scene is physically plausible, 1 if not, 2 if it cannot be made or judged.
 
     Args:
-        source: A scene such as rooms:7 or kitchen:3 (see `simtrack scenes`), or the folder of a run.
+        source: A scene such as rooms:7 or kitchen:3 (see `simtrack scenes`), or the folder of a run or of a map.
         out: Folder for the results; runs/reconstruct-SOURCE if not given.
-        entities: Whole meshes (true), partial ones as seen on a walk, or tracked ones of a run, for which that is the
-            default, as true is for scenes.
+        entities: Whole meshes (true), partial ones as seen on a walk, tracked ones of a run, or mapped ones of a map;
+            the last two are the default for such folders, as true is for scenes.
         seed: Of the scene if its name fixes none, and of the walk.
         overwrite: Replace the results in an existing folder.
         time_limit: Seconds that each engine of the check may take.
     """
     from simtrack.cli import console
+    from simtrack.cli.folders import new_folder
     from simtrack.evaluation.entity_sources import source_entities
     from simtrack.plausibility.check import check_urdf
     from simtrack.report.reconstruction_page import write_reconstruction_page
@@ -51,7 +49,7 @@ def reconstruct(
     folder = out if out is not None else Path("runs") / default
     with (
         console.ProgressLine(f"reconstruct {source}", "collecting entities", to_stderr=True) as line,
-        new_folder(folder, overwrite) as work,
+        new_folder(folder, overwrite, FILES, FOLDERS) as work,
     ):
         given = source_entities(source, entities, seed)
         line.say("planes and contact graph")
@@ -98,47 +96,6 @@ def _name_file(path: Path) -> None:
     document = json.loads(path.read_text(encoding="utf-8"))
     document["file"] = Path(document["file"]).name
     path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
-
-
-@contextmanager
-def new_folder(folder: Path, overwrite: bool) -> Iterator[Path]:
-    """A folder to work in, beside the wanted one, which it becomes if all goes well; else nothing is left of it.
-
-    Raises:
-        OutputExistsError: the wanted one exists and may not be overwritten.
-        InvalidValueError: it is a file, or cannot be written.
-    """
-    from simtrack.errors import InvalidValueError, OutputExistsError
-
-    if folder.exists() and not folder.is_dir():
-        raise InvalidValueError("out", str(folder), "a folder, but this is a file")
-    if folder.exists() and not overwrite:
-        raise OutputExistsError(folder)
-    work = folder.with_name(f".{folder.name}.part")
-    try:
-        work.parent.mkdir(parents=True, exist_ok=True)
-        rmtree(work, ignore_errors=True)
-        work.mkdir()
-    except OSError as error:
-        raise InvalidValueError("out", str(folder), f"a folder that can be written ({error.strerror})") from error
-    try:
-        yield work
-        _replace(folder, work)
-    finally:
-        rmtree(work, ignore_errors=True)
-
-
-def _replace(folder: Path, work: Path) -> None:
-    """Move the results into place; of an older folder, its results are removed and nothing else."""
-    if not folder.exists():
-        work.rename(folder)
-        return
-    for name in FILES:
-        (folder / name).unlink(missing_ok=True)
-    for name in FOLDERS:
-        rmtree(folder / name, ignore_errors=True)
-    for made in work.iterdir():
-        made.rename(folder / made.name)
 
 
 def _show(made: "Reconstruction", report: "CheckReport") -> None:

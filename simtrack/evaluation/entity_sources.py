@@ -1,4 +1,4 @@
-"""Entities to reconstruct a scene from: of rooms (true, or as seen on a walk), and of what a run believed."""
+"""Entities to reconstruct a scene from: of rooms (true, or seen on a walk), of a map, and of what a run believed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +13,9 @@ from simtrack.perception.scene_graph.contact.nodes import EntityMesh, Finding
 from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
 from simtrack.simulation.scene_file import SceneFile, load_scene
 
-EntityChoice: TypeAlias = Literal["true", "partial", "tracked"]
+LISTING = "entities.json"
+"""What tells the folder of a map."""
+EntityChoice: TypeAlias = Literal["true", "partial", "tracked", "mapped"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +35,9 @@ def source_entities(source: str, choice: EntityChoice | None = None, seed: int =
     """Entities of a scene (``rooms:7``) or of the folder of a run.
 
     Args:
-        source: name or path of a scene, or the folder of a run.
-        choice: ``true`` meshes, ``partial`` ones as seen on a walk, or ``tracked`` ones; if None, tracked for runs and
-            true for scenes.
+        source: name or path of a scene, or the folder of a run or of a map.
+        choice: ``true`` meshes, ``partial`` ones as seen on a walk, ``tracked`` or ``mapped`` ones; if None, mapped for
+            maps, tracked for runs and true for scenes.
         seed: of a scene whose name fixes none, and of the walk.
 
     Raises:
@@ -47,6 +49,8 @@ def source_entities(source: str, choice: EntityChoice | None = None, seed: int =
         raise InvalidValueError("entities", choice, ", ".join(get_args(EntityChoice)))
     folder = Path(source)
     if folder.is_dir() and not (folder / "scene.yaml").is_file():
+        if choice == "mapped" or (choice is None and (folder / LISTING).is_file()):
+            return mapped_entities(folder)
         if choice not in (None, "tracked"):
             raise InvalidValueError("entities", choice, f"tracked: {source} is the folder of a run")
         from simtrack.evaluation.run_entities import tracked_entities
@@ -54,11 +58,27 @@ def source_entities(source: str, choice: EntityChoice | None = None, seed: int =
         run = tracked_entities(folder)
         return SourceEntities(run.name, run.entities, run.models, run.findings)
     scene = load_scene(source)
-    if choice == "tracked":
-        raise InvalidValueError("entities", choice, f"true or partial: {source} is a scene, and nothing tracked it yet")
+    if choice in ("tracked", "mapped"):
+        raise InvalidValueError(
+            "entities", choice, f"true or partial: {source} is a scene, and nothing {choice} it yet"
+        )
     if scene.static.builder != "room":
         return scene_objects(scene, choice or "true", seed)
     return room_entities(scene, choice or "true", seed)
+
+
+def mapped_entities(folder: Path) -> SourceEntities:
+    """Entities of the folder of a panoptic map, every wall by itself.
+
+    Raises:
+        FileFormatError, MeshError: a file of it is missing or broken.
+    """
+    from simtrack.perception.mapping.panoptic.files import read_entities
+    from simtrack.perception.mapping.panoptic.layout import split_walls
+
+    entities = split_walls(read_entities(folder), np.random.default_rng(0))
+    meshes = tuple(EntityMesh(e.name, e.semantic_class, e.mesh) for e in entities)
+    return SourceEntities(folder.resolve().name, meshes)
 
 
 def room_entities(scene: SceneFile, choice: EntityChoice, seed: int) -> SourceEntities:

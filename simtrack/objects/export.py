@@ -1,7 +1,7 @@
 """Write object models for other programs: PLY in millimetres with BOP's ``models_info.json``, OBJ, an overview."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -92,15 +92,32 @@ def describe(model: ObjectModel) -> dict[str, Any]:
     }
 
 
-def write_ply(path: Path, mesh: Mesh, scale: float = 1.0) -> None:
+def write_ply(
+    path: Path,
+    mesh: Mesh,
+    scale: float = 1.0,
+    labels: Mapping[str, np.ndarray | int] | None = None,
+    comments: Iterable[str] = (),
+) -> None:
     """Binary little-endian PLY with vertex normals and, where the mesh has colours, vertex colours.
 
     Vertices between faces of several colours take the colour of the first of them.
+
+    Args:
+        path: of the file.
+        mesh: to be written.
+        scale: of the coordinates.
+        labels: further integer properties of the vertices, (V,) or one number for all, by name.
+        comments: lines of the header.
     """
+    labels = labels or {}
     fields = [(n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")]
     if mesh.face_colors is not None:
         fields += [(n, "u1") for n in ("red", "green", "blue")]
+    fields += [(name, "<i4") for name in labels]
     rows = np.zeros(len(mesh.vertices), dtype=fields)
+    for name, values in labels.items():
+        rows[name] = values
     rows["x"], rows["y"], rows["z"] = scale * mesh.vertices.T
     rows["nx"], rows["ny"], rows["nz"] = meshes.vertex_normals(mesh).T
     if mesh.face_colors is not None:
@@ -109,8 +126,10 @@ def write_ply(path: Path, mesh: Mesh, scale: float = 1.0) -> None:
             rows[name][corners] = mesh.face_colors[first // 3, k]
     faces = np.empty(len(mesh.faces), dtype=[("n", "u1"), ("i", "<i4", 3)])
     faces["n"], faces["i"] = 3, mesh.faces
-    properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in fields]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties,
+    kinds = {"<f4": "float", "u1": "uchar", "<i4": "int"}
+    properties = [f"property {kinds[kind]} {name}" for name, kind in fields]
+    notes = [f"comment {line}" for line in comments]
+    header = ["ply", "format binary_little_endian 1.0", *notes, f"element vertex {len(rows)}", *properties,
               f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]  # fmt: skip
     path.write_bytes("\n".join(header).encode("ascii") + rows.tobytes() + faces.tobytes())
 

@@ -50,7 +50,7 @@ class RoomView:
         for number, (name, node) in enumerate(graph.nodes.items()):
             if node.shape is None or name in self.hidden:
                 continue
-            color = LAYOUT_COLOR if is_layout(node) else _varied(colors[node.semantic_class], number)
+            color = LAYOUT_COLOR if is_layout(node) else varied(colors[node.semantic_class], number)
             mesh = transformed(node.shape.mesh, node.T_map_entity)
             meshes.append((mesh, np.tile(np.array(color, float), (len(mesh.faces), 1))))
         return self.image(meshes)
@@ -69,34 +69,64 @@ class RoomView:
 
     def image(self, meshes: Sequence[tuple[Mesh, Float64]]) -> Uint8:
         """(H, W, 3) RGB of meshes with (F, 3) colours; both sides of a face are seen."""
-        import cv2
-
-        from simtrack.raycast import RayBundle, RayScene, TriangleMesh
-
-        image = np.tile(np.array(GROUND, float), (self.intrinsics.height * self.intrinsics.width, 1))
-        scene = RayScene()
-        try:
-            for number, (mesh, _) in enumerate(meshes):
-                scene.add(TriangleMesh(mesh.vertices, mesh.faces, str(number)), instance=number)
-            bundle = RayBundle.from_camera(self.intrinsics)
-            hits = scene.cast(bundle, self.T_map_camera, self.reach)
-            rays = bundle.directions @ self.T_map_camera[:3, :3].T
-            for number, (mesh, colors) in enumerate(meshes):
-                own = np.flatnonzero(hits.hit & (hits.instances == number))
-                if not len(own):
-                    continue
-                faces = hits.faces[own]
-                normals = face_normals(mesh)[faces]
-                normals = normals * -np.sign(np.einsum("nd,nd->n", normals, rays[own]))[:, None]
-                light = 0.62 + 0.38 * np.clip(normals @ (LIGHT / np.linalg.norm(LIGHT)), -0.4, 1.0)
-                image[own] = colors[faces] * light[:, None]
-        finally:
-            scene.close()
-        image = image.reshape(self.intrinsics.height, self.intrinsics.width, 3).clip(0, 255).astype(np.uint8)
-        return np.asarray(cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
+        return shaded(meshes, self.T_map_camera, self.intrinsics, self.reach)
 
 
-def _varied(color: str, number: int) -> tuple[float, float, float]:
+def shaded(
+    meshes: Sequence[tuple[Mesh, Float64]],
+    T_map_camera: Float64,
+    intrinsics: CameraIntrinsics,
+    reach: float,
+    *,
+    backs: bool = True,
+) -> Uint8:
+    """(HEIGHT, WIDTH, 3) RGB of meshes with (F, 3) colours.
+
+    Args:
+        meshes: in the map, with their colours.
+        T_map_camera: (4, 4).
+        intrinsics: of an image that is reduced by `SUPERSAMPLING`.
+        reach: metres along the optical axis beyond which nothing is drawn.
+        backs: whether faces that look away from the camera are seen.
+    """
+    import cv2
+
+    from simtrack.raycast import RayBundle, RayScene, TriangleMesh
+
+    image = np.tile(np.array(GROUND, float), (intrinsics.height * intrinsics.width, 1))
+    if not backs:
+        meshes = [_front(mesh, colors, T_map_camera[:3, 3]) for mesh, colors in meshes]
+    scene = RayScene()
+    try:
+        for number, (mesh, _) in enumerate(meshes):
+            if not len(mesh.faces):
+                continue
+            scene.add(TriangleMesh(mesh.vertices, mesh.faces, str(number)), instance=number)
+        bundle = RayBundle.from_camera(intrinsics)
+        hits = scene.cast(bundle, T_map_camera, reach)
+        rays = bundle.directions @ T_map_camera[:3, :3].T
+        for number, (mesh, colors) in enumerate(meshes):
+            own = np.flatnonzero(hits.hit & (hits.instances == number))
+            if not len(own):
+                continue
+            faces = hits.faces[own]
+            normals = face_normals(mesh)[faces]
+            normals = normals * -np.sign(np.einsum("nd,nd->n", normals, rays[own]))[:, None]
+            light = 0.62 + 0.38 * np.clip(normals @ (LIGHT / np.linalg.norm(LIGHT)), -0.4, 1.0)
+            image[own] = colors[faces] * light[:, None]
+    finally:
+        scene.close()
+    image = image.reshape(intrinsics.height, intrinsics.width, 3).clip(0, 255).astype(np.uint8)
+    return np.asarray(cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _front(mesh: Mesh, colors: Float64, eye: Float64) -> tuple[Mesh, Float64]:
+    """The faces that look towards a point."""
+    facing = np.einsum("fd,fd->f", eye - mesh.triangles.mean(axis=1), face_normals(mesh)) > 0.0
+    return Mesh(mesh.vertices, mesh.faces[facing]), colors[facing]
+
+
+def varied(color: str, number: int) -> tuple[float, float, float]:
     """A class's colour, a little lighter or darker from entity to entity."""
     rgb = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
     factor = 0.86 + 0.28 * ((number * 0.618) % 1.0)

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from simtrack.cli.folders import new_folder
 from simtrack.cli.main import main
-from simtrack.cli.reconstruct import FILES, new_folder
+from simtrack.cli.reconstruct import FILES, FOLDERS
 from simtrack.errors import InvalidValueError, OutputExistsError
 
 
@@ -33,7 +34,7 @@ def test_overwriting_replaces_own_files_and_nothing_else(tmp_path: Path) -> None
     (out / "meshes" / "old.obj").write_text("old")
     (out / "notes.txt").write_text("the user's")
     (out / FILES[-1]).write_text("old")
-    with new_folder(out, overwrite=True) as work:
+    with new_folder(out, True, FILES, FOLDERS) as work:
         (work / "meshes").mkdir()
         (work / "meshes" / "new.obj").write_text("new")
     assert sorted(str(path.relative_to(out)) for path in out.rglob("*")) == ["meshes", "meshes/new.obj", "notes.txt"]

@@ -1,0 +1,157 @@
+"""What a panoptic map is made from: a room that is filmed, or a recording of an RGB-D camera."""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from simtrack.contracts import Float64, Int32, RgbdFrame
+from simtrack.errors import InvalidValueError
+from simtrack.perception.segmentation.panoptic import PanopticSegments, Segmenter
+from simtrack.simulation.building.rooms.film import FilmConfig, FilmFrame, RoomFilm
+from simtrack.simulation.building.rooms.physics import SettledRoom
+from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
+from simtrack.simulation.oracles.segmenter import OracleSegmenter
+from simtrack.simulation.scene_file import load_scene
+
+
+class NoSegmenter:
+    """Finds nothing: the map is one of geometry alone."""
+
+    def segment(self, frame: RgbdFrame) -> PanopticSegments:
+        """No segments."""
+        return PanopticSegments(frame.stamp, np.zeros(frame.depth.shape, np.int32), (), np.zeros(0, np.float32))
+
+
+@dataclass(frozen=True, slots=True)
+class MapFrame:
+    """One frame of a source."""
+
+    frame: RgbdFrame
+    T_map_camera: Float64 | None
+    """(4, 4), or None where the source does not say."""
+    truth: FilmFrame | None = None
+    """What was truly seen, where that is known."""
+
+
+class LatestLabels:
+    """True labels of the frame that was shown last: what an oracle looks up."""
+
+    def __init__(self) -> None:
+        self._stamp, self._image = -1, np.zeros((0, 0), np.int32)
+
+    def show(self, truth: FilmFrame) -> None:
+        """Take a frame."""
+        self._stamp, self._image = truth.frame.stamp, truth.instances
+
+    def __call__(self, stamp: int) -> Int32:
+        """Labels (H, W) of the frame of that stamp; InvalidValueError for another than the last."""
+        if stamp != self._stamp:
+            raise InvalidValueError("stamp", stamp, f"that of the latest frame, {self._stamp}")
+        return self._image
+
+
+@dataclass(frozen=True, slots=True)
+class MapSource:
+    """Frames with poses, and a segmenter for them."""
+
+    name: str
+    """Fit for a file's name."""
+    count: int
+    """Frames."""
+    frames: Callable[[], Iterator[MapFrame]]
+    """Anew at each call."""
+    segmenter: Segmenter
+    room: SettledRoom | None = None
+    """The truth, where it is known."""
+    held: AbstractContextManager[object] = field(default_factory=nullcontext)
+    """What must be released afterwards."""
+
+
+def room_source(
+    seed: int,
+    kind: RoomKind | None = None,
+    film: FilmConfig | None = None,
+    strength: float = 1.0,
+    film_seed: int = 0,
+    name: str | None = None,
+) -> MapSource:
+    """A settled room as somebody films it, segmented by an oracle.
+
+    Args:
+        seed: of the room.
+        kind: of the room; drawn from the seed if None.
+        film: how it is filmed.
+        strength: of the oracle's errors.
+        film_seed: of the walk, the noise and the errors.
+        name: of the source.
+    """
+    from simtrack.simulation.building.rooms.physics import settled_room
+
+    OracleSegmenter(LatestLabels(), (), strength)  # refuses bad values before a room is built
+    room = settled_room(seed, kind)
+    shot = RoomFilm(room, film, film_seed)
+    labels = LatestLabels()
+    oracle = OracleSegmenter(labels, [e.semantic_class for e in room.entities], strength, film_seed)
+
+    def frames() -> Iterator[MapFrame]:
+        for seen in shot:
+            labels.show(seen)
+            yield MapFrame(seen.frame, seen.T_map_camera, seen)
+
+    return MapSource(name or f"rooms-{seed}", len(shot), frames, oracle, room, shot)
+
+
+def map_source(
+    source: str, segmenter: str | None = None, film: FilmConfig | None = None, strength: float = 1.0, seed: int = 0
+) -> MapSource:
+    """The source that a user names.
+
+    Args:
+        source: a furnished room (``rooms:7``), or a recording of an RGB-D camera with poses.
+        segmenter: ``oracle`` or ``none``; if None, the oracle for rooms and none for recordings.
+        film: how a room is filmed; of a recording, the first `FilmConfig.frames` frames are taken.
+        strength: of the oracle's errors.
+        seed: of a scene whose name fixes none, of the walk and of the errors.
+
+    Raises:
+        UnknownNameError: no such scene.
+        FileFormatError: a recording that is none.
+        InvalidValueError: it is no room or has no poses, or no such segmenter.
+    """
+    if segmenter not in (None, "oracle", "none"):
+        raise InvalidValueError("segmenter", segmenter, "oracle, none")
+    path, film = Path(source), film or FilmConfig()
+    if path.exists() and not (path / "scene.yaml").is_file() and path.suffix not in (".yaml", ".yml", ".xml"):
+        if segmenter == "oracle":
+            raise InvalidValueError("segmenter", segmenter, f"none: nobody knows what {source} truly shows")
+        return _recording(path, film)
+    scene = load_scene(source)
+    if scene.static.builder != "room":
+        raise InvalidValueError("source", source, "a furnished room such as rooms:7, or a folder of RGB-D images")
+    number = scene.static.seed if scene.static.seed is not None else seed
+    kind: RoomKind | None = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
+    made = room_source(number, kind, film, strength, seed, f"{scene.name}-{number}")
+    if segmenter == "none":
+        return MapSource(made.name, made.count, made.frames, NoSegmenter(), made.room, made.held)
+    return made
+
+
+def _recording(path: Path, film: FilmConfig) -> MapSource:
+    from itertools import islice
+
+    from simtrack.recordings.source import open_log
+
+    log = open_log(path)
+    if log.sensor != "camera" or not log.posed:
+        raise InvalidValueError("source", str(path), "a recording of an RGB-D camera that states the camera's poses")
+    count = film.frames if log.count is None else min(film.frames, log.count)
+
+    def frames() -> Iterator[MapFrame]:
+        for entry in islice(log.read(), count):
+            if isinstance(entry.frame, RgbdFrame):
+                yield MapFrame(entry.frame, entry.T_map_sensor)
+
+    return MapSource(path.resolve().name, count, frames, NoSegmenter())

@@ -1,0 +1,277 @@
+"""What was observed of global segments: Phi(l, c, p) of the reconstruction paper, and what follows from it.
+
+`JointCounts` counts semantic class c and instance p of a segment l together (sections 3.2 to 3.4). `SeparateCounts` is
+what the paper compares with: Phi(l, c) and Phi(l, p) by themselves, as in Voxblox++ (Grinvald et al., RA-L 2019).
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+BACKGROUND = ""
+"""Class of what no panoptic segment covers."""
+NOBODY = 0
+"""Instance of the background."""
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One panoptic segment of a frame, or one piece of background, on the global segments that it lies on."""
+
+    semantic_class: str
+    labels: tuple[int, ...]
+    """Global segments l, the largest first."""
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentEntity:
+    """What a global segment is part of."""
+
+    semantic_class: str
+    instance: int
+    agreeing: int
+    """Observations of the segment that say so ..."""
+    observed: int
+    """... of so many."""
+
+
+class PanopticCounts(Protocol):
+    """Keeps and interprets counts."""
+
+    def observe(self, observations: Sequence[Observation]) -> None:
+        """Find the instances that the things of a frame are, and count."""
+        ...
+
+    def merge(self, label: int, into: int) -> None:
+        """Two global segments are one."""
+        ...
+
+    def alike(self, label: int, other: int) -> bool:
+        """Whether nothing that was observed speaks against two global segments being one."""
+        ...
+
+    def regularize(self) -> None:
+        """Merge instances that are one."""
+        ...
+
+    def entities(self) -> Mapping[int, SegmentEntity]:
+        """Global segment -> what it is part of; background is missing."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CountsConfig:
+    """Settings of the counts."""
+
+    stuff: frozenset[str] = frozenset({"floor", "wall", "ceiling"})
+    """Classes that are one instance each, whatever is seen of them, where counts are joint."""
+    merge_share: float = 0.5
+    """m_th of Eq. 5."""
+    merge_count: int = 10
+    """Counts that two instances must have on common segments to be merged."""
+    common: float = 0.25
+    """Share of a segment's counts for a class that each of two instances needs for the segment to be common to both.
+    The paper has 0: then one frame that takes two chairs for one makes their segments common."""
+    labelled: float = 0.35
+    """Share of the frames that see a segment in which something must cover it, for it not to be background."""
+
+
+class JointCounts:
+    """Phi(l, c, p)."""
+
+    def __init__(self, config: CountsConfig | None = None) -> None:
+        self.config = config or CountsConfig()
+        self.phi: dict[int, dict[tuple[str, int], int]] = defaultdict(dict)
+        """l -> (c, p) -> count."""
+        self._stuff: dict[str, int] = {}
+        self._fresh = 1
+
+    def observe(self, observations: Sequence[Observation]) -> None:
+        """Section 3.2 and Eq. 4.
+
+        The instance of a thing maximises Phi(l, c, p), summed over the segments that the thing lies on; no two things
+        of a frame are the same instance, the better founded one has it.
+        """
+        found: dict[int, int] = {}
+        votes: list[tuple[int, int, int]] = []
+        for number, seen in enumerate(observations):
+            if seen.semantic_class == BACKGROUND:
+                found[number] = NOBODY
+            elif seen.semantic_class in self.config.stuff:
+                found[number] = self._stuff_instance(seen.semantic_class)
+            else:
+                totals: dict[int, int] = defaultdict(int)
+                for label in seen.labels:
+                    for (name, p), count in self.phi[label].items():
+                        if name == seen.semantic_class:
+                            totals[p] += count
+                votes += [(-count, number, p) for p, count in totals.items()]
+        taken: set[int] = set()
+        for _, number, p in sorted(votes):
+            if number not in found and p not in taken:
+                found[number] = p
+                taken.add(p)
+        for number, seen in enumerate(observations):
+            p = found[number] if number in found else self._new()
+            for label in seen.labels:
+                counts = self.phi[label]
+                counts[seen.semantic_class, p] = counts.get((seen.semantic_class, p), 0) + 1
+
+    def merge(self, label: int, into: int) -> None:
+        """Add the counts of one segment to those of another."""
+        counts = self.phi[into]
+        for key, count in self.phi.pop(label, {}).items():
+            counts[key] = counts.get(key, 0) + count
+
+    def alike(self, label: int, other: int) -> bool:
+        """Whether both are the same entity, or one of them none."""
+        first, second = self._entity(label), self._entity(other)
+        return first is None or second is None or _key(first) == _key(second)
+
+    def regularize(self) -> None:
+        """Eq. 5: merge two instances of a class that were long associated with common segments."""
+        config = self.config
+        classes = {name for counts in self.phi.values() for name, p in counts if p != NOBODY}
+        for name in sorted(classes - config.stuff):
+            while True:
+                instances, table = self._table(name)
+                if len(instances) < 2:
+                    break
+                shared = table >= np.maximum(config.common * table.sum(axis=1, keepdims=True), 1.0)
+                # Counts of p1 where p2 is associated too, and of p2 where p1 is.
+                common = (shared * table).T @ shared
+                common = common + common.T
+                total = table.sum(axis=0)
+                share = common / np.maximum(total[:, None] + total[None, :], 1.0)
+                share[(common <= config.merge_count) | np.eye(len(instances), dtype=bool)] = 0.0
+                first, second = np.unravel_index(int(share.argmax()), share.shape)
+                if share[first, second] < config.merge_share:
+                    break
+                self._merge_instances(name, instances[max(first, second)], instances[min(first, second)])
+
+    def entities(self) -> Mapping[int, SegmentEntity]:
+        """Eq. 6."""
+        found = ((label, self._entity(label)) for label in sorted(self.phi))
+        return {label: entity for label, entity in found if entity is not None}
+
+    def _entity(self, label: int) -> SegmentEntity | None:
+        classes: dict[str, int] = defaultdict(int)
+        counts = self.phi.get(label, {})
+        for (name, _), count in counts.items():
+            classes[name] += count
+        name = _winner(classes, self.config.labelled)
+        if name is None:
+            return None
+        count, negative = max((count, -p) for (c, p), count in counts.items() if c == name)
+        return SegmentEntity(name, -negative, count, sum(counts.values()))
+
+    def _table(self, name: str) -> tuple[list[int], np.ndarray]:
+        """Instances of a class, and (L, P) float64 their counts on its segments."""
+        labels = sorted(label for label, counts in self.phi.items() if any(c == name for c, _ in counts))
+        instances = sorted({p for label in labels for c, p in self.phi[label] if c == name})
+        column = {p: k for k, p in enumerate(instances)}
+        table = np.zeros((len(labels), len(instances)))
+        for row, label in enumerate(labels):
+            for (c, p), count in self.phi[label].items():
+                if c == name:
+                    table[row, column[p]] = count
+        return instances, table
+
+    def _merge_instances(self, name: str, p: int, into: int) -> None:
+        for counts in self.phi.values():
+            count = counts.pop((name, p), 0)
+            if count:
+                counts[name, into] = counts.get((name, into), 0) + count
+
+    def _stuff_instance(self, name: str) -> int:
+        if name not in self._stuff:
+            self._stuff[name] = self._new()
+        return self._stuff[name]
+
+    def _new(self) -> int:
+        self._fresh += 1
+        return self._fresh - 1
+
+
+class SeparateCounts:
+    """Phi(l, c) and Phi(l, p)."""
+
+    def __init__(self, config: CountsConfig | None = None) -> None:
+        self.config = config or CountsConfig()
+        self.classes: dict[int, dict[str, int]] = defaultdict(dict)
+        """l -> c -> count."""
+        self.instances: dict[int, dict[int, int]] = defaultdict(dict)
+        """l -> p -> count."""
+        self._fresh = 1
+
+    def observe(self, observations: Sequence[Observation]) -> None:
+        """Greedily: a thing is the likeliest instance of its largest segment that is not yet taken in this frame."""
+        taken: set[int] = set()
+        for seen in observations:
+            p = NOBODY
+            if seen.semantic_class != BACKGROUND:
+                p = self._likeliest(seen.labels[:1], taken)
+                taken.add(p)
+            for label in seen.labels:
+                _add(self.classes[label], seen.semantic_class)
+                _add(self.instances[label], p)
+
+    def merge(self, label: int, into: int) -> None:
+        """Add the counts of one segment to those of another."""
+        for key, count in self.classes.pop(label, {}).items():
+            _add(self.classes[into], key, count)
+        for key, count in self.instances.pop(label, {}).items():
+            _add(self.instances[into], key, count)
+
+    def alike(self, label: int, other: int) -> bool:
+        """Always: geometry alone decides."""
+        return True
+
+    def regularize(self) -> None:
+        """Nothing: instances are not merged."""
+
+    def entities(self) -> Mapping[int, SegmentEntity]:
+        """The likeliest instance of each segment; its class is the one that most was counted for on its segments."""
+        own: dict[int, int] = {}
+        votes: dict[int, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+        for label in sorted(self.instances):
+            name = _winner(self.classes[label], self.config.labelled)
+            real = [(count, -p) for p, count in self.instances[label].items() if p != NOBODY]
+            if name is None or not real:
+                continue
+            own[label] = -max(real)[1]
+            votes[own[label]][name] += sum(self.classes[label].values())
+        return {
+            label: SegmentEntity(
+                max(sorted(votes[p]), key=votes[p].__getitem__), p, self.instances[label][p],
+                sum(self.instances[label].values()),
+            )
+            for label, p in own.items()
+        }  # fmt: skip
+
+    def _likeliest(self, labels: Iterable[int], taken: Set[int]) -> int:
+        for label in labels:
+            free = [(count, -p) for p, count in self.instances[label].items() if p != NOBODY and p not in taken]
+            if free:
+                return -max(free)[1]
+        self._fresh += 1
+        return self._fresh - 1
+
+
+def _key(entity: SegmentEntity) -> tuple[str, int]:
+    return entity.semantic_class, entity.instance
+
+
+def _winner(classes: Mapping[str, int], labelled: float) -> str | None:
+    """The class with the greatest count, of equal ones the first by name; None for background."""
+    total, named = sum(classes.values()), {name: count for name, count in classes.items() if name != BACKGROUND}
+    if not named or sum(named.values()) < labelled * total:
+        return None
+    return max(sorted(named), key=named.__getitem__)
+
+
+def _add(counts: dict, key: object, count: int = 1) -> None:
+    counts[key] = counts.get(key, 0) + count

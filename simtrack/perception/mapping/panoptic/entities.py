@@ -1,0 +1,125 @@
+"""Entities of a panoptic map as meshes: section 3.4 of the reconstruction paper."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from simtrack.contracts import Float32, Int32, Uint8
+from simtrack.errors import InvalidValueError
+from simtrack.geometry.meshes import Mesh, face_areas
+from simtrack.perception.mapping.panoptic import surface_kernels as kernels
+from simtrack.perception.mapping.panoptic.counts import SegmentEntity
+from simtrack.perception.mapping.panoptic.volume import Volume
+
+STUFF_FIRST = ("floor", "wall", "ceiling")
+
+
+@dataclass(frozen=True, slots=True)
+class EntityConfig:
+    """Settings of `extract_entities`."""
+
+    least_weight: float = 0.2
+    """1/m^2: voxels of less weight (one reading at a metre has 1) count as unseen."""
+    least_area: float = 0.002
+    """Square metres; smaller entities are dropped."""
+
+    def __post_init__(self) -> None:
+        for name in ("least_weight", "least_area"):
+            if not 0.0 < getattr(self, name) < 1e6:
+                raise InvalidValueError(f"EntityConfig.{name}", getattr(self, name), "a finite number > 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapEntityMesh:
+    """One entity <o, c, M> of a map."""
+
+    name: str
+    """Unique instance label o: the class and a running number."""
+    semantic_class: str
+    instance: int
+    """Global instance p."""
+    score: float
+    """0 to 1: share of the observations of its segments that say that they are this."""
+    mesh: Mesh
+    """Map frame, faces coloured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """The zero set of a volume."""
+
+    vertices: Float32
+    """(V, 3), map frame, metres."""
+    colors: Uint8
+    """(V, 3) RGB."""
+    faces: Int32
+    """(F, 3), counter-clockwise seen from the free side."""
+    labels: Int32
+    """(F,), of segments as voxels carry them; 0 = none."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """The surface in the colours of its faces' first corners."""
+        return Mesh(self.vertices.astype(np.float64), self.faces, self.colors[self.faces[:, 0]])
+
+
+def extract_surface(volume: Volume, least_weight: float) -> Surface:
+    """The zero set of a volume where it was seen with at least that weight."""
+    count, voxel = volume.count, volume.config.voxel
+    around = kernels.neighbours(volume.keys, volume.table, count)
+    cells = np.full(volume.distances[:count].shape, -1, np.int32)
+    arguments = around, volume.keys, volume.distances, volume.weights, volume.colors, voxel, least_weight, cells
+    points, tints = np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)
+    found = kernels.vertices(*arguments, points, tints)
+    points, tints = np.empty((found, 3), np.float32), np.empty((found, 3), np.uint8)
+    kernels.vertices(*arguments, points, tints)
+    corners, owners = np.empty((3 * found, 4), np.int32), np.empty(3 * found, np.int32)
+    found = kernels.quads(around, volume.distances, volume.labels, cells, corners, owners)
+    corners, owners = corners[:found], owners[:found]
+    faces = np.stack([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
+    return Surface(points, tints, faces, np.repeat(owners, 2))
+
+
+def extract_entities(
+    volume: Volume, canonical: Int32, entities: Mapping[int, SegmentEntity], config: EntityConfig | None = None
+) -> tuple[MapEntityMesh, ...]:
+    """One mesh an entity.
+
+    Args:
+        volume: the map.
+        canonical: (L,), what each label was merged into.
+        entities: global segment -> class and instance (Eq. 6).
+        config: settings, the defaults if None.
+    """
+    config = config or EntityConfig()
+    surface = extract_surface(volume, config.least_weight)
+    parts: dict[tuple[str, int], list[SegmentEntity]] = defaultdict(list)
+    for each in entities.values():
+        parts[each.semantic_class, each.instance].append(each)
+    keys = sorted(parts, key=lambda key: (key[0] not in STUFF_FIRST, *key))
+    number = {key: k for k, key in enumerate(keys)}
+    of_label = np.full(len(canonical), -1, np.int32)
+    for label, each in entities.items():
+        of_label[label] = number[each.semantic_class, each.instance]
+    owner = of_label[canonical][surface.labels]
+    order = np.argsort(owner, kind="stable")
+    bounds = np.searchsorted(owner[order], np.arange(len(keys) + 1))
+    found: list[MapEntityMesh] = []
+    running: dict[str, int] = {}
+    for k, (name, p) in enumerate(keys):
+        mesh = _part(surface, order[bounds[k] : bounds[k + 1]])
+        if len(mesh.faces) and face_areas(mesh).sum() >= config.least_area:
+            running[name] = running.get(name, 0) + 1
+            agreeing, observed = sum(e.agreeing for e in parts[name, p]), sum(e.observed for e in parts[name, p])
+            found.append(MapEntityMesh(f"{name}{running[name]}", name, p, agreeing / observed, mesh))
+    return tuple(found)
+
+
+def _part(surface: Surface, chosen: np.ndarray) -> Mesh:
+    used, faces = np.unique(surface.faces[chosen], return_inverse=True)
+    faces = faces.reshape(-1, 3).astype(np.int32)
+    mesh = Mesh(surface.vertices[used].astype(np.float64), faces, surface.colors[used][faces[:, 0]])
+    keep = face_areas(mesh) > 0.0
+    return mesh if keep.all() else Mesh(mesh.vertices, faces[keep], surface.colors[used][faces[keep, 0]])

@@ -1,0 +1,165 @@
+"""Panoptic and geometric segments of one frame made one: section 3.1 of the reconstruction paper.
+
+Every geometric segment takes the panoptic segment that covers most of it. Two steps make up for what that loses: a
+panoptic segment inside a larger geometric one is split out of it (a keyboard on a table), and of the geometric segments
+of one thing only the largest Euclidean cluster stays with it (the floor behind a chair does not).
+"""
+
+from collections.abc import Sequence, Set
+from dataclasses import dataclass
+
+import numpy as np
+
+from simtrack.contracts import CameraIntrinsics, Float32, Float64, Int32
+from simtrack.errors import InvalidValueError
+from simtrack.perception.segmentation.panoptic import PanopticSegments
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFusionConfig:
+    """Settings of `fuse_segments`."""
+
+    split: bool = True
+    """Whether panoptic segments are split out of geometric ones."""
+    inside: float = 0.9
+    """Share of a panoptic segment that must lie in a geometric one to be split out of it ..."""
+    part: float = 0.5
+    """... of which it must be less than this share; one with more outside all geometric segments is one by itself."""
+    min_pixels: int = 40
+    """Readings, of an image of 640 x 480, that a segment needs which is split out, or which no geometric one covers."""
+    covered: float = 0.2
+    """Share of a geometric segment that the panoptic one which it takes must cover."""
+    cluster: bool = True
+    """Whether things keep only their largest cluster."""
+    distance: float = 0.05
+    """Metres between segments of one cluster."""
+
+    def __post_init__(self) -> None:
+        for name in ("inside", "part", "covered"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InvalidValueError(f"FrameFusionConfig.{name}", getattr(self, name), "a share, 0 to 1")
+        if not 0.0 < self.distance < 10.0:
+            raise InvalidValueError("FrameFusionConfig.distance", self.distance, "metres, above 0 and below 10")
+        if self.min_pixels < 1:
+            raise InvalidValueError("FrameFusionConfig.min_pixels", self.min_pixels, "1 or more")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSegments:
+    """The segments (P_k, c_k, o_k) of one frame."""
+
+    image: Int32
+    """(H, W): number of the segment that a reading belongs to, from 1; 0 = none."""
+    instances: Int32
+    """(N + 1,): number of the panoptic segment that each one belongs to, 0 = background; entry 0 is not a segment."""
+    sizes: Int32
+    """(N + 1,): readings."""
+
+    def __len__(self) -> int:
+        return len(self.instances) - 1
+
+
+def fuse_segments(
+    geometric: Int32,
+    panoptic: PanopticSegments,
+    depth: Float32,
+    intrinsics: CameraIntrinsics,
+    stuff: Set[str] = frozenset(),
+    config: FrameFusionConfig | None = None,
+) -> FrameSegments:
+    """Fuse the two segmentations of a frame.
+
+    Args:
+        geometric: (H, W), from 1; 0 = none.
+        panoptic: segments of the image.
+        depth: (H, W), metres, 0 = no reading.
+        intrinsics: of the image.
+        stuff: classes whose segments need not hang together.
+        config: settings, the defaults if None.
+    """
+    config = config or FrameFusionConfig()
+    read, masks = depth > 0.0, len(panoptic)
+    pairs = np.where(read, geometric * (masks + 1) + panoptic.image, 0)
+    size = (int(geometric.max(initial=0)) + 1) * (masks + 1)
+    joint = np.bincount(pairs[read], minlength=size).reshape(-1, masks + 1)
+    least = max(1, round(config.min_pixels * (intrinsics.width / 640.0) ** 2))
+    extracted = _extracted(joint, least, config) if config.split else np.zeros_like(joint, bool)
+    table = np.repeat(np.arange(len(joint)), masks + 1).reshape(joint.shape)
+    table[extracted] = len(joint) + np.arange(int(extracted.sum()))
+    rest = np.where(extracted, 0, joint)
+    total, taken = rest.sum(axis=1), np.where(rest[:, 1:].size, rest[:, 1:], 0)
+    best = taken.argmax(axis=1) if masks else np.zeros(len(rest), np.int64)
+    covering = taken[np.arange(len(rest)), best] if masks else np.zeros(len(rest), np.int64)
+    covered = (covering > 0) & (covering >= config.covered * total)
+    instances = np.concatenate([np.where(covered, best + 1, 0), np.nonzero(extracted)[1]]).astype(np.int32)
+    sizes = np.concatenate([total, joint[extracted]]).astype(np.int32)
+    instances[0] = sizes[0] = 0
+    numbers = np.where(sizes > 0, np.cumsum(sizes > 0), 0).astype(np.int32)
+    image = np.where(read, numbers[table].ravel()[pairs], 0).astype(np.int32)
+    kept = np.concatenate([[0], np.flatnonzero(sizes > 0)])
+    segments = FrameSegments(image, instances[kept], sizes[kept])
+    if config.cluster and masks:
+        things = [k + 1 for k, name in enumerate(panoptic.classes) if name not in stuff]
+        _keep_largest_clusters(segments, panoptic.image, things, depth, intrinsics, config.distance)
+    return segments
+
+
+def _extracted(joint: np.ndarray, least: int, config: FrameFusionConfig) -> np.ndarray:
+    """(G + 1, M + 1) bool: where a panoptic segment is split out of a geometric one, or is all that covers readings."""
+    of_mask = joint / np.maximum(joint.sum(axis=0, keepdims=True), 1)
+    of_segment = joint / np.maximum(joint.sum(axis=1, keepdims=True), 1)
+    found = (of_mask > config.inside) & (of_segment < config.part)
+    # What no geometric segment covers is on edges, unless that is most of the mask: then it is small or thin.
+    found[0] = of_mask[0] > config.part
+    found &= joint >= least
+    found[:, 0] = False
+    return found
+
+
+def _keep_largest_clusters(
+    segments: FrameSegments, masks: Int32, things: Sequence[int], depth: Float32, intrinsics: CameraIntrinsics,
+    distance: float,
+) -> None:  # fmt: skip
+    """Send the segments of a thing that are not in its largest cluster to the background, in place.
+
+    Readings of its mask that are in no segment, as those on edges, hold segments together too.
+    """
+    stride = max(1, intrinsics.width // 320)  # rows on a table top seen at a grazing angle are far apart
+    sparse, mask = segments.image[::stride, ::stride], masks[::stride, ::stride]
+    free = (sparse == 0) & (depth[::stride, ::stride] > 0.0)
+    for thing in things:
+        members = np.flatnonzero(segments.instances == thing)
+        if len(members) < 2:
+            continue
+        masks_of = [sparse == number for number in members.tolist()]
+        points = [_points(chosen, depth, intrinsics, stride, 0.5 * distance) for chosen in masks_of]
+        loose = _points(free & (mask == thing), depth, intrinsics, stride, 0.5 * distance)
+        cluster = _clusters([*points, *loose[:, None]], distance)[: len(members)]
+        weight = np.bincount(cluster, segments.sizes[members])
+        segments.instances[members[cluster != weight.argmax()]] = 0
+
+
+def _points(mask: np.ndarray, depth: Float32, intrinsics: CameraIntrinsics, stride: int, cell: float) -> Float64:
+    """(N, 3) points in the camera frame of the readings in a mask of every stride-th pixel, one a cell of a grid."""
+    v, u = np.nonzero(mask)
+    v, u = v * stride, u * stride
+    z = depth[v, u].astype(float)
+    x, y = (u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z
+    points = np.stack([x, y, z], axis=1).astype(np.float64)
+    cells = np.floor(points / cell).astype(np.int64) + (1 << 20)
+    return points[np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_index=True)[1]]
+
+
+def _clusters(groups: Sequence[Float64], distance: float) -> np.ndarray:
+    """(N,) number of the cluster of each group of points: single linkage, at most `distance` metres apart."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    points = np.concatenate(groups)
+    owner = np.repeat(np.arange(len(groups)), [len(g) for g in groups])
+    pairs = KDTree(points).query_pairs(distance, output_type="ndarray") if len(points) else np.empty((0, 2), int)
+    links = owner[pairs]
+    links = links[links[:, 0] != links[:, 1]]
+    graph = coo_matrix((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), (len(groups),) * 2)
+    return connected_components(graph, directed=False)[1]

@@ -1,0 +1,195 @@
+"""The panoptic map: frames in, entities out."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from simtrack.contracts import Float64, Int32, RgbdFrame, Status
+from simtrack.errors import InvalidValueError
+from simtrack.geometry.transforms import is_rigid
+from simtrack.perception.mapping.panoptic.association import AssociationConfig, SegmentLabels
+from simtrack.perception.mapping.panoptic.counts import (
+    BACKGROUND,
+    NOBODY,
+    CountsConfig,
+    JointCounts,
+    Observation,
+    PanopticCounts,
+    SeparateCounts,
+)
+from simtrack.perception.mapping.panoptic.entities import EntityConfig, MapEntityMesh, extract_entities
+from simtrack.perception.mapping.panoptic.frame_segments import FrameFusionConfig, FrameSegments, fuse_segments
+from simtrack.perception.mapping.panoptic.volume import Volume, VolumeConfig
+from simtrack.perception.segmentation.geometric import GeometricConfig, depth_segments
+from simtrack.perception.segmentation.panoptic import PanopticSegments
+
+Method: TypeAlias = Literal["full", "no-joint-fusion", "voxbloxpp"]
+METHODS: tuple[Method, ...] = ("full", "no-joint-fusion", "voxbloxpp")
+
+
+@dataclass(frozen=True, slots=True)
+class PanopticMapConfig:
+    """Settings of a `PanopticMap`."""
+
+    volume: VolumeConfig = field(default_factory=VolumeConfig)
+    geometric: GeometricConfig = field(default_factory=GeometricConfig)
+    fusion: FrameFusionConfig = field(default_factory=FrameFusionConfig)
+    association: AssociationConfig = field(default_factory=AssociationConfig)
+    counts: CountsConfig = field(default_factory=CountsConfig)
+    entities: EntityConfig = field(default_factory=EntityConfig)
+    joint: bool = True
+    """Whether classes and instances are counted together."""
+    max_depth: float = 4.0
+    """Metres; farther readings are not used."""
+    regularize_every: int = 10
+    """Frames."""
+
+    def __post_init__(self) -> None:
+        if not 0.1 <= self.max_depth <= 50.0:
+            raise InvalidValueError("PanopticMapConfig.max_depth", self.max_depth, "0.1 to 50 metres")
+        if self.regularize_every < 1:
+            raise InvalidValueError("PanopticMapConfig.regularize_every", self.regularize_every, "1 or more")
+
+    @staticmethod
+    def of_method(method: Method, voxel: float = 0.02) -> "PanopticMapConfig":
+        """The settings of a method of the reconstruction paper's Table 2.
+
+        ``full``; ``no-joint-fusion``, the ablation, which counts classes and instances separately; ``voxbloxpp``, which
+        besides neither splits nor clusters the segments of a frame.
+
+        Raises:
+            InvalidValueError: no such method.
+        """
+        if method not in METHODS:
+            raise InvalidValueError("method", method, ", ".join(METHODS))
+        config = PanopticMapConfig(volume=VolumeConfig(voxel=voxel), joint=method == "full")
+        if method == "voxbloxpp":
+            config = replace(config, fusion=FrameFusionConfig(split=False, cluster=False))
+        return config
+
+
+@dataclass(frozen=True, slots=True)
+class MapUpdate:
+    """What a frame did to the map."""
+
+    stamp: int
+    """Nanoseconds, of the frame."""
+    status: Status
+    """OK, or NO_DATA or FAILED: the map is as it was."""
+    reason: str = ""
+    """Why the frame was skipped."""
+    segments: int = 0
+    """Segments of the frame."""
+    blocks: int = 0
+    """Blocks of voxels that it was fused into."""
+
+
+class PanopticMap:
+    """A TSDF whose voxels carry labels of segments, and what was observed of those."""
+
+    def __init__(self, config: PanopticMapConfig | None = None) -> None:
+        self.config = config or PanopticMapConfig()
+        self.volume = Volume(self.config.volume)
+        self.labels = SegmentLabels(self.config.association)
+        counts = JointCounts if self.config.joint else SeparateCounts
+        self.counts: PanopticCounts = counts(self.config.counts)
+        self.frames = 0
+        """Frames that were fused."""
+        self.skipped: dict[str, int] = {}
+        """Reason -> frames that were not."""
+
+    def integrate(
+        self,
+        frame: RgbdFrame,
+        T_map_camera: Float64 | None,
+        panoptic: PanopticSegments | None,
+        geometric: Int32 | None = None,
+    ) -> MapUpdate:
+        """Fuse one frame.
+
+        A frame that cannot be used is skipped and counted, and leaves the map as it was.
+
+        Args:
+            frame: depth is needed, colour is not.
+            T_map_camera: (4, 4); None where it is not known.
+            panoptic: segments of the image; None where the segmenter failed.
+            geometric: (H, W) numbers of geometric segments, from 1; None has them made of the depth.
+        """
+        reason = _unusable(frame, T_map_camera, panoptic)
+        if reason or T_map_camera is None or panoptic is None:
+            return self._skip(frame, reason)
+        depth = np.where(frame.depth <= self.config.max_depth, frame.depth, np.float32(0.0))
+        depth = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
+        if not depth.any():
+            return self._skip(frame, "no readings", Status.NO_DATA)
+        if geometric is None:
+            geometric = depth_segments(depth, frame.intrinsics, self.config.geometric)
+        stuff = self.config.counts.stuff
+        segments = fuse_segments(geometric, panoptic, depth, frame.intrinsics, stuff, self.config.fusion)
+        stride = max(1, round(frame.intrinsics.width / 320))
+        met, counts = self.volume.overlaps(
+            depth, segments.image, frame.intrinsics, T_map_camera, self.labels.canonical, stride
+        )
+        least = max(
+            1, round(self.config.association.least_readings * (frame.intrinsics.width / 640.0 * 2 / stride) ** 2)
+        )
+        labels = self.labels.associate(met, counts, least)
+        image = labels[segments.image]
+        try:
+            blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera)
+        except InvalidValueError as error:
+            return self._skip(frame, str(error))
+        self.counts.observe(_observations(segments, labels, panoptic))
+        for label, other in self.labels.count_overlaps(met, counts, least):
+            self._merge(label, other)
+        self.frames += 1
+        if self.frames % self.config.regularize_every == 0:
+            self.counts.regularize()
+        return MapUpdate(frame.stamp, Status.OK, segments=len(segments), blocks=blocks)
+
+    def entities(self) -> tuple[MapEntityMesh, ...]:
+        """The entities of the map, stuff first, then things, by class and number."""
+        self.counts.regularize()
+        return extract_entities(self.volume, self.labels.canonical, self.counts.entities(), self.config.entities)
+
+    def _merge(self, label: int, other: int) -> None:
+        canonical = self.labels.canonical
+        first, second = sorted((int(canonical[label]), int(canonical[other])))
+        if first != second and self.counts.alike(first, second):
+            self.labels.merge(second, into=first)
+            self.counts.merge(second, into=first)
+
+    def _skip(self, frame: RgbdFrame, reason: str, status: Status = Status.FAILED) -> MapUpdate:
+        self.skipped[reason] = self.skipped.get(reason, 0) + 1
+        return MapUpdate(frame.stamp, status, reason)
+
+
+def _unusable(frame: RgbdFrame, T_map_camera: Float64 | None, panoptic: PanopticSegments | None) -> str:
+    """Why a frame cannot be used, or nothing."""
+    if T_map_camera is None:
+        return "no pose"
+    if not is_rigid(np.asarray(T_map_camera, float)):
+        return "the pose is not a rigid transform"
+    if panoptic is None:
+        return "no segmentation"
+    if panoptic.image.shape != frame.depth.shape:
+        return "masks and depth differ in size"
+    if frame.depth.shape != (frame.intrinsics.height, frame.intrinsics.width):
+        return "depth and intrinsics differ in size"
+    if frame.rgb is not None and frame.rgb.shape[:2] != frame.depth.shape:
+        return "colour and depth differ in size"
+    return ""
+
+
+def _observations(segments: FrameSegments, labels: Int32, panoptic: PanopticSegments) -> list[Observation]:
+    """Panoptic segments with the labels that they lie on, the largest first; every piece of background by itself."""
+    found: list[Observation] = []
+    order = np.argsort(-segments.sizes, kind="stable")
+    order = order[(order > 0) & (segments.sizes[order] > 0)]
+    for number, name in enumerate(panoptic.classes, start=1):
+        own = order[segments.instances[order] == number]
+        if len(own):
+            found.append(Observation(name, tuple(labels[own].tolist())))
+    background = order[segments.instances[order] == NOBODY]
+    return [*found, *(Observation(BACKGROUND, (label,)) for label in labels[background].tolist())]

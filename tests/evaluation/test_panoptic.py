@@ -1,0 +1,119 @@
+"""Panoptic quality and average precision: what is perfect scores 1, and every kind of mistake costs what it should."""
+
+import numpy as np
+import pytest
+
+from simtrack.evaluation.mapping import MapScores, class_means
+from simtrack.evaluation.panoptic import (
+    PanopticCount,
+    PanopticEntity,
+    ScoredClass,
+    TrueSurface,
+    box_iou,
+    compare,
+    mean_precision,
+    panoptic_counts,
+    predicted_entity,
+    scored_classes,
+)
+from simtrack.evaluation.panoptic_rooms import (
+    RoomMapTask,
+    ordering,
+    scores_from_json,
+    scores_to_json,
+    summed,
+    tables_of,
+)
+from simtrack.geometry.meshes import Mesh, box_mesh
+
+
+def entity(name: str, x: float, size: float = 0.4, score: float = 1.0) -> PanopticEntity:
+    """A cube at a place; its class is its name without digits."""
+    mesh = box_mesh((size, size, size))
+    return predicted_entity(name, name.rstrip("0123456789"), score, Mesh(mesh.vertices + [x, 0.0, 0.0], mesh.faces))
+
+
+def truth(*entities: PanopticEntity, void: tuple[str, ...] = ()) -> TrueSurface:
+    return TrueSurface(entities, np.array([e.name in void for e in entities]))
+
+
+TRUE = truth(entity("chair1", 0.0), entity("chair2", 1.0), entity("table1", 2.0))
+
+
+def test_the_truth_itself_is_perfect() -> None:
+    found = compare(TRUE.entities, TRUE)
+    assert class_means(panoptic_counts(found)) == (1.0, 1.0, 1.0)
+    assert np.allclose(found.iou, np.eye(3)) and found.accuracy.max() == 0.0
+    assert mean_precision(scored_classes(TRUE.entities, TRUE, found.iou)) == 1.0
+    assert np.allclose(box_iou(TRUE.entities, TRUE), np.eye(3))
+
+
+def test_missing_wrong_and_renamed_entities_are_counted() -> None:
+    guess = [entity("chair1", 0.0), entity("sofa1", 1.0), entity("table1", 2.0), entity("table2", 5.0)]
+    counts = panoptic_counts(compare(guess, TRUE))
+    assert (counts["chair"].matched, counts["chair"].wrong, counts["chair"].missed) == (1, 0, 1)
+    assert (counts["sofa"].wrong, counts["table"].wrong) == (1, 1)
+    assert counts["chair"].rq == pytest.approx(2 / 3) and counts["table"].rq == pytest.approx(2 / 3)
+
+
+def test_surface_where_there_is_none_costs_overlap_and_leniently_does_too() -> None:
+    near = entity("table1", 2.0)
+    ghost = np.concatenate([near.points, near.points[: len(near.points) // 2] + [0.0, 0.0, 3.0]])
+    guess = [PanopticEntity("table1", "table", 1.0, ghost, near.box)]
+    assert compare(guess, TRUE).iou[0, 2] == pytest.approx(1 / 1.5, abs=0.01)
+
+
+def test_unseen_surface_counts_but_not_leniently() -> None:
+    part = entity("table1", 2.0)
+    half = PanopticEntity("table1", "table", 1.0, part.points[part.points[:, 2] > 0.05], part.box)
+    alone = truth(part)
+    assert compare([half], alone).iou[0, 0] < 0.6
+    assert compare([half], alone, lenient=True).iou[0, 0] == 1.0
+
+
+def test_what_was_hardly_seen_is_neither_missed_nor_wrong() -> None:
+    actual = truth(entity("chair1", 0.0), entity("table1", 2.0), void=("table1",))
+    assert "table" not in panoptic_counts(compare([entity("chair1", 0.0)], actual))
+    assert panoptic_counts(compare([entity("sofa1", 2.0)], actual)) == {"chair": PanopticCount(missed=1)}
+
+
+def test_an_empty_map_finds_nothing() -> None:
+    found = compare([], TRUE)
+    assert class_means(panoptic_counts(found)) == (0.0, 0.0, 0.0) and not np.isfinite(found.completeness).any()
+
+
+def test_one_hit_of_four_is_worth_what_the_definition_says() -> None:
+    one = ScoredClass(((0.9, True),), true=4)
+    assert one.average_precision() == pytest.approx(3 / 11) and one.average_precision(lenient=True) == 1.0
+    assert ScoredClass((), true=4).average_precision() == 0.0
+    assert ScoredClass((), true=4).average_precision(lenient=True) is None
+
+
+def test_a_true_thing_is_found_once_by_the_surest() -> None:
+    guess = [entity("table1", 2.0, score=0.4), entity("table2", 2.0, score=0.9)]
+    iou = np.array([[0.0, 0.0, 0.9], [0.0, 0.0, 0.8]])
+    assert scored_classes(guess, TRUE, iou)["table"].hits == ((0.9, True), (0.4, False))
+
+
+def scores(matched: int) -> MapScores:
+    counts = {"chair": PanopticCount(matched, 1, 0, 0.8 * matched)}
+    hits = {"chair": ScoredClass(((0.5, True),), 2)}
+    return MapScores(counts, counts, counts, hits, hits, hits, (0.001, 0.004), 0.9, 4, 10)
+
+
+def test_scores_of_rooms_add_up_and_survive_their_file() -> None:
+    assert scores_from_json(scores_to_json(scores(3))) == scores(3)
+    both = summed([scores(1), scores(3)])
+    chair = both.panoptic["chair"]
+    assert (chair.matched, chair.wrong, chair.missed) == (4, 2, 0) and chair.overlap == pytest.approx(3.2)
+    assert both.nodes == 20
+    assert both.instances["chair"].true == 4
+
+
+def test_tables_name_every_room_and_method() -> None:
+    task = RoomMapTask(7, False, ("full", "voxbloxpp"), 1.0, 10, 0.02)
+    done = {task: {"full": scores(3), "voxbloxpp": scores(1)}}
+    tables = tables_of(done, done[task])
+    assert tables["Table 1: PQ, SQ, RQ, mAP@0.5 by room"][1][0][0] == "rooms:7"
+    assert all(len(row) == len(columns) for columns, rows in tables.values() for row in rows)
+    assert ordering(done, "full", "voxbloxpp") == (1, 1)

@@ -1,0 +1,228 @@
+"""The panoptic map: surfaces come back, segments keep their labels, counts decide, nonsense changes nothing."""
+
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from simtrack.contracts import CameraIntrinsics, Float64, RgbdFrame, Status
+from simtrack.errors import FileFormatError, InvalidValueError
+from simtrack.geometry.meshes import Mesh, box_mesh, face_areas, face_normals
+from simtrack.geometry.transforms import look_at
+from simtrack.perception.mapping.panoptic.association import SegmentLabels
+from simtrack.perception.mapping.panoptic.counts import CountsConfig, JointCounts, Observation, SeparateCounts
+from simtrack.perception.mapping.panoptic.entities import MapEntityMesh, extract_surface
+from simtrack.perception.mapping.panoptic.files import read_entities, write_entities
+from simtrack.perception.mapping.panoptic.frame_segments import FrameFusionConfig, fuse_segments
+from simtrack.perception.mapping.panoptic.layout import split_walls
+from simtrack.perception.mapping.panoptic.panoptic_map import PanopticMap, PanopticMapConfig
+from simtrack.perception.mapping.panoptic.volume import Volume, VolumeConfig
+from simtrack.perception.segmentation.panoptic import PanopticSegments
+from simtrack.raycast import RayBundle, RayScene, TriangleMesh
+
+CAMERA = CameraIntrinsics(160, 120, 145.0, 145.0, 79.5, 59.5)
+VOXEL = 0.02
+BOX = Mesh(box_mesh((0.5, 0.4, 0.3)).vertices + [0.0, 0.0, 0.15], box_mesh((0.5, 0.4, 0.3)).faces)
+GROUND = Mesh(box_mesh((3.0, 3.0, 0.2)).vertices - [0.0, 0.0, 0.1], box_mesh((3.0, 3.0, 0.2)).faces)
+
+
+def views(count: int) -> list[tuple[RgbdFrame, Float64, PanopticSegments]]:
+    """A box on the ground, seen from around: frames, poses and true segments."""
+    seen, bundle = [], RayBundle.from_camera(CAMERA)
+    with RayScene() as scene:
+        for number, mesh in enumerate((GROUND, BOX)):
+            scene.add(TriangleMesh(mesh.vertices, mesh.faces), instance=number)
+        for k in range(count):
+            angle = 2.0 * np.pi * k / count
+            T = look_at(np.array([1.2 * np.cos(angle), 1.2 * np.sin(angle), 0.9]), np.array([0.0, 0.0, 0.1]))
+            hits = scene.cast(bundle, T)
+            depth = np.where(hits.hit, hits.distances, 0.0).astype(np.float32).reshape(120, 160)
+            rgb = np.where(hits.instances.reshape(120, 160, 1) == 1, (200, 40, 40), (90, 90, 90)).astype(np.uint8)
+            image = np.where(hits.hit, hits.instances + 1, 0).astype(np.int32).reshape(120, 160)
+            segments = PanopticSegments(k, image, ("floor", "box"), np.ones(2, np.float32))
+            seen.append((RgbdFrame(k, depth, rgb, CAMERA, np.eye(4), k), T, segments))
+    return seen
+
+
+@pytest.fixture(scope="module")
+def mapped() -> PanopticMap:
+    panoptic_map = PanopticMap(PanopticMapConfig.of_method("full", VOXEL))
+    for frame, T, segments in views(6):
+        assert panoptic_map.integrate(frame, T, segments).status is Status.OK
+    return panoptic_map
+
+
+def test_surfaces_come_back_where_they_were_and_face_the_camera(mapped: PanopticMap) -> None:
+    surface = extract_surface(mapped.volume, 1.0).mesh
+    with RayScene() as scene:
+        for number, mesh in enumerate((GROUND, BOX)):
+            scene.add(TriangleMesh(mesh.vertices, mesh.faces), instance=number)
+        off = scene.closest_points(surface.vertices).distances
+    assert np.median(off) < 0.002 and np.quantile(off, 0.95) < VOXEL
+    flat = (np.abs(surface.triangles[:, :, 2]).max(axis=1) < 0.005) & (face_areas(surface) > 0.1 * VOXEL**2)
+    assert flat.sum() > 1000 and np.quantile(face_normals(surface)[flat, 2], 0.02) > 0.5
+
+
+def test_every_entity_is_one_mesh_of_its_class(mapped: PanopticMap) -> None:
+    entities = {entity.name: entity for entity in mapped.entities()}
+    assert set(entities) == {"floor1", "box1"}
+    np.testing.assert_allclose(entities["box1"].mesh.extents, (0.5, 0.4, 0.3), atol=2.5 * VOXEL)
+    colors = entities["box1"].mesh.face_colors
+    assert colors is not None and np.median(colors[:, 0]) > 150 and entities["box1"].score == 1.0
+
+
+def test_the_map_does_not_depend_on_the_number_of_threads() -> None:
+    frame, T, segments = views(1)[0]
+    before, volumes = numba.get_num_threads(), []
+    for threads in (1, min(2, before)):
+        numba.set_num_threads(threads)
+        volumes.append(Volume(VolumeConfig(voxel=0.01)))
+        volumes[-1].integrate(frame.depth, frame.rgb, segments.image, CAMERA, T)
+    numba.set_num_threads(before)
+    for name in ("keys", "distances", "weights", "colors", "labels"):
+        np.testing.assert_array_equal(getattr(volumes[0], name), getattr(volumes[1], name))
+
+
+def test_frames_that_cannot_be_used_are_counted_and_change_nothing(mapped: PanopticMap) -> None:
+    frame, T, segments = views(1)[0]
+    small = PanopticSegments(0, np.zeros((3, 3), np.int32), (), np.zeros(0, np.float32))
+    blind = RgbdFrame(0, np.zeros((120, 160), np.float32), None, CAMERA, np.eye(4))
+    before = [mapped.volume.count, mapped.frames, mapped.volume.weights.sum(), len(mapped.labels.canonical)]
+    for bad, status in (
+        ((frame, None, segments), Status.FAILED),
+        ((frame, 2.0 * T, segments), Status.FAILED),
+        ((frame, T, None), Status.FAILED),
+        ((frame, T, small), Status.FAILED),
+        ((blind, T, segments), Status.NO_DATA),
+    ):
+        update = mapped.integrate(*bad)
+        assert update.status is status and update.reason in mapped.skipped
+    assert [mapped.volume.count, mapped.frames, mapped.volume.weights.sum(), len(mapped.labels.canonical)] == before
+
+
+def test_a_map_that_would_grow_too_large_stays_as_it_was() -> None:
+    frame, T, segments = views(1)[0]
+    volume = Volume(VolumeConfig(voxel=0.01, max_blocks=50))
+    with pytest.raises(InvalidValueError, match="max_blocks"):
+        volume.integrate(frame.depth, None, segments.image, CAMERA, T)
+    assert volume.count == 0 and not volume.weights.any()
+
+
+# ------------------------------------------------------------------------------------------------- one frame's fusion
+
+
+def test_a_mask_inside_a_geometric_segment_is_split_out_of_it() -> None:
+    geometric = np.ones((120, 160), np.int32)
+    image = np.ones((120, 160), np.int32)
+    image[40:60, 40:80] = 2
+    depth = np.full((120, 160), 2.0, np.float32)
+    panoptic = PanopticSegments(0, image, ("table", "keyboard"), np.ones(2, np.float32))
+    split = fuse_segments(geometric, panoptic, depth, CAMERA)
+    assert len(split) == 2 and sorted(split.instances[1:].tolist()) == [1, 2]
+    assert split.sizes[split.image[50, 50]] == 800 and split.instances[split.image[50, 50]] == 2
+    whole = fuse_segments(geometric, panoptic, depth, CAMERA, config=FrameFusionConfig(split=False))
+    assert len(whole) == 1 and whole.instances[1] == 1
+
+
+@pytest.mark.parametrize(("gap", "kept"), [(0.02, True), (1.0, False)])
+def test_only_the_largest_cluster_stays_with_a_thing(gap: float, kept: bool) -> None:
+    geometric = np.ones((120, 160), np.int32)
+    geometric[:, 110:] = 2
+    depth = np.where(geometric == 2, 1.0 + gap, 1.0).astype(np.float32)
+    panoptic = PanopticSegments(0, np.ones((120, 160), np.int32), ("chair",), np.ones(1, np.float32))
+    fused = fuse_segments(geometric, panoptic, depth, CAMERA)
+    assert fused.instances[fused.image[0, 0]] == 1 and bool(fused.instances[fused.image[0, 150]] == 1) is kept
+    stuff = fuse_segments(geometric, panoptic, depth, CAMERA, {"chair"})
+    assert stuff.instances[stuff.image[0, 150]] == 1
+
+
+# ------------------------------------------------------------------------------------------------- labels and counts
+
+
+def test_a_label_has_one_segment_a_frame_and_the_larger_overlap_has_it() -> None:
+    labels = SegmentLabels()
+    none = np.zeros((3, 1), np.int32)
+    assert labels.associate(np.empty(0, np.int32), none, 10).tolist() == [0, 1, 2]
+    counts = np.array([[0, 0], [500, 300], [500, 400]], np.int32)
+    assert labels.associate(np.array([1], np.int32), counts, 10).tolist() == [0, 3, 1]
+
+
+def test_labels_that_keep_sharing_segments_are_merged_after_enough_frames() -> None:
+    labels = SegmentLabels()
+    labels.associate(np.empty(0, np.int32), np.zeros((3, 1), np.int32), 10)
+    counts = np.array([[0, 0, 0], [500, 250, 250]], np.int32)
+    ready = [labels.count_overlaps(np.array([1, 2], np.int32), counts, 10) for _ in range(4)]
+    assert ready == [[], [], [], [(1, 2)]]
+    labels.merge(2, into=1)
+    assert labels.canonical.tolist() == [0, 1, 1]
+
+
+def test_classes_and_instances_are_counted_together() -> None:
+    counts = JointCounts()
+    for _ in range(5):
+        counts.observe([Observation("chair", (1, 2)), Observation("chair", (3,))])
+    counts.observe([Observation("table", (1,)), Observation("", (4,))])
+    entities = counts.entities()
+    assert entities[1].semantic_class == "chair" and entities[1].instance == entities[2].instance
+    assert entities[1].instance != entities[3].instance and 4 not in entities
+    assert (entities[1].agreeing, entities[1].observed) == (5, 6)
+    assert sum(sum(c.values()) for c in counts.phi.values()) == 5 * 3 + 2  # Eq. 4: one count a segment and frame
+
+
+def test_no_two_things_of_a_frame_are_the_same_instance() -> None:
+    counts = JointCounts()
+    counts.observe([Observation("chair", (1, 2))])  # two chairs taken for one
+    for _ in range(3):
+        counts.observe([Observation("chair", (1,)), Observation("chair", (2,))])
+    assert counts.entities()[1].instance != counts.entities()[2].instance
+
+
+def test_stuff_is_one_instance_where_counts_are_joint_and_not_where_they_are_separate() -> None:
+    joint, separate = JointCounts(), SeparateCounts()
+    for counts in (joint, separate):
+        counts.observe([Observation("wall", (1,))])
+        counts.observe([Observation("wall", (2,))])
+    assert joint.entities()[1].instance == joint.entities()[2].instance
+    assert separate.entities()[1].instance != separate.entities()[2].instance
+
+
+def test_instances_that_share_their_segments_are_merged() -> None:
+    counts = JointCounts(CountsConfig(merge_count=4))
+    counts.phi = {1: {("chair", 1): 5, ("chair", 2): 4}, 2: {("chair", 1): 1}, 3: {("chair", 7): 9}}
+    counts.regularize()
+    assert counts.phi[1] == {("chair", 1): 9} and counts.phi[3] == {("chair", 7): 9}
+
+
+# ---------------------------------------------------------------------------------------------------------------- files
+
+
+def test_entities_survive_their_files(tmp_path: Path) -> None:
+    write_entities(
+        [MapEntityMesh("box1", "box", 4, 0.75, BOX), MapEntityMesh("floor1", "floor", 1, 1.0, GROUND)], tmp_path
+    )
+    box, floor = read_entities(tmp_path)
+    assert (box.name, box.semantic_class, box.instance, box.score) == ("box1", "box", 4, 0.75)
+    np.testing.assert_allclose(box.mesh.bounds, BOX.bounds, atol=1e-6)
+    assert floor.semantic_class == "floor" and b"comment class floor" in (tmp_path / "entities/floor1.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "{}", '[{"name": "x"}]', '[{"name":"a","class":"b","instance":1,"score":1,"file":"../x.ply"}]']
+)
+def test_broken_listings_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "entities.json").write_text(text)
+    with pytest.raises(FileFormatError):
+        read_entities(tmp_path)
+
+
+def test_walls_are_told_apart() -> None:
+    walls = [box_mesh((2.0, 0.01, 2.0)), box_mesh((0.01, 2.0, 2.0))]
+    parts = [Mesh(w.vertices + s, w.faces) for w, s in zip(walls, ([1.0, 0.0, 1.0], [0.0, 1.0, 1.0]), strict=True)]
+    both = Mesh(
+        np.concatenate([p.vertices for p in parts]),
+        np.concatenate([parts[0].faces, parts[1].faces + 8]).astype(np.int32),
+    )
+    split = split_walls([MapEntityMesh("wall1", "wall", 1, 1.0, both)], np.random.default_rng(0))
+    sides = {int(np.argmin(entity.mesh.extents[:2])) for entity in split}
+    assert sides == {0, 1} and all(min(entity.mesh.extents[:2]) < 0.05 for entity in split)
