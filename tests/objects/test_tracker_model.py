@@ -81,4 +81,4 @@ def test_settings_do_not_change_what_else_is_drawn() -> None:
 )
 def test_values_outside_their_domain_are_refused(field: str, value: float) -> None:
     with pytest.raises(InvalidValueError, match=f"TrackerModelConfig.{field}"):
-        TrackerModelConfig(**{field: value})
+        TrackerModelConfig(**{field: value})  # pyright: ignore[reportArgumentType]
