@@ -78,7 +78,7 @@ def test_ctrl_c_leaves_complete_scenes(recipe: Path, made: Path, tmp_path: Path)
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     _, message = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == 130, message
     assert "Traceback" not in message
     assert "the same command carries on" in message
     left, whole = tree(out), tree(made)

@@ -49,7 +49,7 @@ def test_folder_is_complete(folder: Path) -> None:
     names = {path.name for path in folder.iterdir()}
     assert names == {
         "config.yaml", "estimates.csv", "tracks.csv", "trajectory.csv", "poses.csv", "simtrack_workbench-test.csv",
-        "graph.json", "map.npz", "metrics.json", "report.html",
+        "graph.json", "map.npz", "metrics.json", "moments", "report.html",
     }  # fmt: skip
     with (folder / "trajectory.csv").open() as file:
         lines = list(csv.DictReader(file))
