@@ -35,7 +35,7 @@ def bench(
 
     from simtrack.benchmarks.harness import Options
     from simtrack.errors import InvalidValueError
-    from simtrack.evaluation.closed_loop import set_threads
+    from simtrack.evaluation.process import set_threads
 
     if threads < 1:
         raise InvalidValueError("threads", threads, "1 or more")

@@ -48,7 +48,7 @@ def env(
     """
     from simtrack.cli import console
     from simtrack.errors import InvalidValueError
-    from simtrack.evaluation.closed_loop import set_threads
+    from simtrack.evaluation.process import set_threads
 
     if episodes < 1:
         raise InvalidValueError("episodes", episodes, "1 or more")

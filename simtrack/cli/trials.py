@@ -29,9 +29,9 @@ def trials(
     """
     from simtrack.cli import console
     from simtrack.errors import InvalidValueError
-    from simtrack.evaluation.closed_loop import set_threads
     from simtrack.evaluation.localization_trials import run_trials
     from simtrack.evaluation.metrics import measured, write_metrics
+    from simtrack.evaluation.process import set_threads
 
     if count < 1:
         raise InvalidValueError("count", count, "1 or more")

@@ -57,8 +57,9 @@ def _kept(kernel: Any) -> bool:
 
 def main(scene: str, renderer: str) -> None:
     """What the child does; tells on standard output what is being made, a tab between what and to what."""
-    from simtrack.evaluation.closed_loop import Clock, closed
+    from simtrack.evaluation.closed_loop import closed
     from simtrack.evaluation.evaluator import Evaluator
+    from simtrack.evaluation.process import Clock
     from simtrack.evaluation.run_config import RunConfig
     from simtrack.evaluation.start_up import cold_start_told
     from simtrack.simulation.scene_file import load_scene

@@ -9,8 +9,9 @@ import numpy as np
 
 from simtrack.contracts import NANOSECONDS, Float64, SensorFrame
 from simtrack.errors import FileFormatError
-from simtrack.evaluation.closed_loop import Clock, Observer, Progress, StopSignal, peak_memory, set_threads
+from simtrack.evaluation.closed_loop import Observer, Progress
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio
+from simtrack.evaluation.process import Clock, StopSignal, peak_memory, set_threads
 from simtrack.evaluation.run_config import versions
 from simtrack.evaluation.run_folder import EstimateTables, RunFolder
 from simtrack.geometry.transforms import is_rigid

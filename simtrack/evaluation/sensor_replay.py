@@ -16,9 +16,10 @@ import numpy as np
 
 from simtrack.contracts import NANOSECONDS, Float64, Localization, RgbdFrame, Status
 from simtrack.errors import FileFormatError
-from simtrack.evaluation.closed_loop import Clock, Progress, StopSignal, peak_memory, set_threads
+from simtrack.evaluation.closed_loop import Progress
 from simtrack.evaluation.growing_map import GrowingMap, GrowingMapConfig
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio, unmeasured
+from simtrack.evaluation.process import Clock, StopSignal, peak_memory, set_threads
 from simtrack.evaluation.recorded_objects import ObjectStage
 from simtrack.evaluation.residuals import Residuals, map_residuals
 from simtrack.evaluation.run_config import versions

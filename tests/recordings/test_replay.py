@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simtrack.evaluation.closed_loop import Clock, closed, open_log
+from simtrack.evaluation.closed_loop import closed, open_log
+from simtrack.evaluation.process import Clock
 from simtrack.evaluation.replay import Replay
 from simtrack.evaluation.run_config import RunConfig
 from simtrack.evaluation.run_folder import EstimateTables

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from simtrack.contracts import (
     DetectionResult,
     LidarScan,
     Localization,
+    Localizer,
     Odometry,
     PoseHypothesis,
     Relation,
@@ -304,7 +305,7 @@ def test_the_templates_can_be_put_into_a_stack(context: StageContext, models, mo
     below = replace(track, id=2, T_map_object=T_below)
     graph = GuardedSceneGraph(build_stage("scene graph", "boxes_above:BoxesAbove", context))  # type: ignore[arg-type]
     assert graph.update(0, (track, below)) == {Relation("relay-1", "above", "relay-2")}
-    localizer = GuardedLocalizer(build_stage("localizer", "odometry_only:OdometryOnly", context), None)  # type: ignore
+    localizer = GuardedLocalizer(cast(Localizer, build_stage("localizer", "odometry_only:OdometryOnly", context)), None)
     localizer.predict(Odometry(PERIOD, T_MAP_CAMERA, 0.0, 0.0))
     assert np.allclose(localizer.pose_at(PERIOD).T_map_base, T_MAP_CAMERA)
     assert not graph.watch.faults and not localizer.watch.faults
