@@ -1,8 +1,8 @@
 """How the box network learns: samples, loss, and what is told of it on held-out scenes."""
 
 import numpy as np
-import torch
-from torch import Tensor
+import torch  # pyright: ignore[reportMissingImports] - extra `train`
+from torch import Tensor  # pyright: ignore[reportMissingImports] - extra `train`
 
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection.boxes import decoded_boxes

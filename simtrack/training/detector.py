@@ -64,7 +64,7 @@ def train_part(part: Part, config: TrainingConfig, told: "Callable[[Progress], N
     Raises:
         DatasetError: a class has no sample.
     """
-    import torch
+    import torch  # pyright: ignore[reportMissingImports] - extra `train`
 
     from simtrack.training.export import export_boxes, export_keypoints
     from simtrack.training.keypoint_task import KeypointTask

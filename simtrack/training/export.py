@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
+import torch  # pyright: ignore[reportMissingImports] - extra `train`
+from torch import nn  # pyright: ignore[reportMissingImports] - extra `train`
 
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection.bins import BEFORE, BINS
@@ -57,7 +57,7 @@ def _export(
     about: dict[str, Any],
     path: Path,
 ) -> None:
-    import onnx
+    import onnx  # pyright: ignore[reportMissingImports] - extra `train`
 
     part = path.with_suffix(".part.onnx")
     with warnings.catch_warnings():
@@ -79,7 +79,7 @@ def _export(
 
 def halve_weights(model: Any) -> None:
     """Keep a model's large weights as 16-bit numbers that are widened when it is loaded; the arithmetic stays."""
-    from onnx import TensorProto, helper, numpy_helper
+    from onnx import TensorProto, helper, numpy_helper  # pyright: ignore[reportMissingImports] - extra `train`
 
     graph, casts = model.graph, []
     for weight in graph.initializer:

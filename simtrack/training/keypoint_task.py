@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor, nn
-from torch.nn import functional
+import torch  # pyright: ignore[reportMissingImports] - extra `train`
+from torch import Tensor, nn  # pyright: ignore[reportMissingImports] - extra `train`
+from torch.nn import functional  # pyright: ignore[reportMissingImports] - extra `train`
 
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection.bins import BINS, LEAST_SIGMA, decoded, position_of

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import torch
-from torch import Tensor, nn
+import torch  # pyright: ignore[reportMissingImports] - extra `train`
+from torch import Tensor, nn  # pyright: ignore[reportMissingImports] - extra `train`
 
 from simtrack.errors import FileFormatError, InvalidValueError
 

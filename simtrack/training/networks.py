@@ -3,9 +3,9 @@
 Plain convolutions with residual connections: on a CPU they train faster than separable ones of equal accuracy.
 """
 
-import torch
-from torch import Tensor, nn
-from torch.nn import functional
+import torch  # pyright: ignore[reportMissingImports] - extra `train`
+from torch import Tensor, nn  # pyright: ignore[reportMissingImports] - extra `train`
+from torch.nn import functional  # pyright: ignore[reportMissingImports] - extra `train`
 
 from simtrack.perception.detection.boxes import STRIDE
 from simtrack.perception.detection.views import CHANNELS
