@@ -147,7 +147,7 @@ class PerceptionStack:
             c.segmentation_time,
             c.wait,
         )
-        self._correction_thread = worker("localization")
+        self._correction_thread = worker("localization", c.wait)
         self._correction = Beside[Localization](self._correction_thread, c.correction_time, c.wait)
         self.localizer = localizer or self._mesh_localizer(static_map, T_map_base)
         self.tracker = tracker or ObjectTracker(models, self.config.tracker)
