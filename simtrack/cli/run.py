@@ -36,7 +36,7 @@ def run(
         duration: Simulated seconds; the scene's own (30 for the workbench) if not given.
         seed: Of everything random.
         out: Folder for the results; runs/SCENE-SEED if not given.
-        agent: What decides where the robot looks and drives: explorer, fixed-gaze, patrol, route; by default the scene's.
+        agent: Decides where the robot looks and drives: explorer, fixed-gaze, patrol, route; by default the scene's.
         tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
         localizer: A localizer of yours, package.module:Class, or oracle: one that knows the truth.
         detector: What detects objects in images: oracle (knows the truth, and errs like a trained network), keypoints
