@@ -76,6 +76,11 @@ class Beside(Generic[T]):
             return False
         return self._wait or self._work[1].done()
 
+    @property
+    def keeps_waiting(self) -> bool:
+        """Whether settling now would have to wait, though nobody is to wait for this piece."""
+        return not self._wait and self._work is not None and not self._work[1].done()
+
     def settle(self) -> T:
         """End the piece and give its answer; waits for it if need be. Raises what the work raised."""
         assert self._work is not None, "no piece has been begun"
