@@ -66,10 +66,14 @@ from simtrack.perception.scene_graph import SceneGraph, SceneGraphConfig
 from simtrack.perception.self_filter import SelfFilter
 from simtrack.perception.tracking.articulation import ArticulationConfig, ArticulationTracker
 from simtrack.perception.tracking.presegmentation import PresegmentationConfig, shot_stamps
+from simtrack.perception.tracking.registration_config import RegistrationConfig
 from simtrack.perception.tracking.target import TrackerConfig
 from simtrack.perception.tracking.tracker import ObjectTracker
 
 T = TypeVar("T")
+
+LIVE_PATIENCE = 0.008
+"""Seconds; where nothing is in their way, the casts before the last one take half of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +99,11 @@ class StackConfig:
 
     @staticmethod
     def live() -> "StackConfig":
-        """For a robot, or a feed at the pace of its clock: a late answer is taken up by the frame that finds it."""
-        return StackConfig(wait=False, tracker=TrackerConfig(wait=False))
+        """For a robot, or a feed at the pace of its clock: a late answer is taken up by the frame that finds it, and a
+        frame that has taken long already is done without the last cast.
+        """
+        registration = RegistrationConfig(patience=LIVE_PATIENCE)
+        return StackConfig(wait=False, tracker=TrackerConfig(wait=False, registration=registration))
 
 
 class PerceptionStack:

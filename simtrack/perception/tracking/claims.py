@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -44,7 +45,12 @@ class Claim:
 
 
 AT_WORK = 8
-"""Claims that are handed to the thread at most; it works at one after the other."""
+"""Claims that are handed to the thread at most; it works at one after the other. Only one where frames do not wait."""
+BEHIND, ROUNDS = 2, 3
+"""Where frames do not wait, one follows a candidate through so many images at most, and the thread through the others;
+but if the thread is still behind after so many times, the frame does what is left."""
+Views: TypeAlias = list[tuple[View, Occluders]]
+"""Depth images, each with what is believed to stand around."""
 
 
 class ClaimQueue:
@@ -56,6 +62,8 @@ class ClaimQueue:
         self._waiting: deque[Claim] = deque()
         self._working: deque[tuple[Claim, int, Paced[Candidate | None]]] = deque()
         """Claims, stamps at which they were handed to the thread, and what it does about them."""
+        self._rounds = 0
+        """How often the thread has followed the first claim's candidate since."""
         self._free = 0
         """Stamp at which the thread is taken to have ended the claim that was settled last, nanoseconds."""
         self._thread = worker("claims", config.wait)
@@ -70,38 +78,49 @@ class ClaimQueue:
                 return
         self._waiting.append(claim)
 
-    def settle(self, stamp: int) -> tuple[Claim, Candidate | None] | None:
-        """The first claim at work and what was found, once its time is up at `stamp`; waits if need be, and may."""
+    def settle(self, stamp: int, later: Callable[[Claim, int], Views]) -> tuple[Claim, Candidate | None] | None:
+        """The first claim at work and what was found, once its time is up; waits if need be, and may.
+
+        Args:
+            stamp: now, nanoseconds.
+            later: images after a stamp, for a claim.
+        """
         if not self._working:
             return None
         claim, begun, work = self._working[0]
         end = work.end(max(begun, self._free), stamp)
         if end is None:
             return None
+        candidate = work.settle()
+        if candidate is not None and not self._config.wait:
+            missed = later(claim, candidate.reached)
+            if len(missed) > BEHIND and self._rounds < ROUNDS:
+                self._rounds += 1
+                self._working[0] = claim, stamp, self._paced(partial(self._led_on, candidate, missed))
+                return None
         self._working.popleft()
-        self._free = end
-        return claim, work.settle()
+        self._free, self._rounds = end, 0
+        return claim, candidate
 
-    def work(self, stamp: int, oldest: int, views: Callable[[Claim], list[tuple[View, Occluders]]]) -> None:
+    def work(self, stamp: int, oldest: int, later: Callable[[Claim, int], Views]) -> None:
         """Begin with the next claims, as far as there is room.
 
         Args:
             stamp: now, nanoseconds.
             oldest: claims whose images are older are dropped, nanoseconds.
-            views: a claim's image and all later ones, with what is believed to stand around in each.
+            later: images after a stamp, for a claim.
         """
-        while self._waiting and len(self._working) < AT_WORK:
+        while self._waiting and len(self._working) < (AT_WORK if self._config.wait else 1):
             claim = self._waiting.popleft()
             if claim.view.stamp < oldest or (claim.target is not None and not claim.target.alive):
                 continue
-            work = Paced[Candidate | None](
-                self._thread, self._config.cast_time, partial(self._candidate, claim, views(claim)), self._config.wait
-            )
+            work = self._paced(partial(self._candidate, claim, later(claim, claim.view.stamp - 1)))
             self._working.append((claim, stamp, work))
 
-    def _candidate(
-        self, claim: Claim, views: list[tuple[View, Occluders]], step: Callable[[], None]
-    ) -> Candidate | None:
+    def _paced(self, work: Callable[[Callable[[], None]], Candidate | None]) -> Paced[Candidate | None]:
+        return Paced(self._thread, self._config.cast_time, work, self._config.wait)
+
+    def _candidate(self, claim: Claim, views: Views, step: Callable[[], None]) -> Candidate | None:
         """Register a claim to its own image, and follow what is found through the later ones."""
         self._prober.count_casts(step)
         (view, around), later = views[0], views[1:]
@@ -111,6 +130,12 @@ class ClaimQueue:
             return None
         candidate = Candidate.found(model, fit, view, self._config)
         candidate.follow(self._prober, later, self._config)
+        return candidate
+
+    def _led_on(self, candidate: Candidate, views: Views, step: Callable[[], None]) -> Candidate:
+        """Follow a candidate through images that came while it was worked at."""
+        self._prober.count_casts(step)
+        candidate.follow(self._prober, views, self._config)
         return candidate
 
     def close(self) -> None:

@@ -6,6 +6,7 @@ or by the paper's Umeyama fits. Directions that the data do not constrain are fo
 moved.
 """
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -134,6 +135,7 @@ class Registration:
         batch = self._batch(depth, intrinsics, poses, None)
         if batch is None:
             return {}
+        began = time.perf_counter()
         predicted = batch.poses.copy()
         self._marks[:] = 0
         self._follow(batch, (config.near,), np.ones(len(batch.instances), bool))
@@ -141,7 +143,8 @@ class Registration:
         if far.any():
             batch.poses[far] = predicted[far]
             self._follow(batch, config.track_schedule, far)
-        if config.finish is not None:
+        hurried = config.patience is not None and time.perf_counter() - began > config.patience
+        if config.finish is not None and not hurried:
             self._follow(batch, (config.finish,), np.ones(len(batch.instances), bool))
         return batch.results(config)
 

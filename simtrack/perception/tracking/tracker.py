@@ -33,7 +33,7 @@ from simtrack.perception.tracking.association import (
     rotation_apart,
 )
 from simtrack.perception.tracking.birth import Occluders, Prober, cost
-from simtrack.perception.tracking.claims import Claim, ClaimQueue
+from simtrack.perception.tracking.claims import Claim, ClaimQueue, Views
 from simtrack.perception.tracking.correspondences import usable_depth
 from simtrack.perception.tracking.filter import Measurement, PoseFilter
 from simtrack.perception.tracking.follow_up import Candidate, measurement
@@ -258,13 +258,19 @@ class ObjectTracker:
 
     def _settle_claims(self, now: int) -> None:
         """Take the answers to the claims whose time is up, and begin with the next ones."""
-        while (settled := self._claims.settle(now)) is not None:
+
+        def later(claim: Claim, stamp: int) -> Views:
+            return self._since(stamp + 1, claim.target)
+
+        while (settled := self._claims.settle(now, later)) is not None:
             claim, candidate = settled
             if candidate is not None and claim.target is None:
                 self._bear(claim, candidate)
             elif candidate is not None:
                 self._contest(claim, candidate)
-        self._claims.work(now, self._views[0].stamp, lambda claim: self._since(claim.view.stamp, claim.target))
+            if not self.config.wait:
+                break  # one a frame: where nobody waits, the others can
+        self._claims.work(now, self._views[0].stamp, later)
 
     def _confirm(self, target: Target, T_camera_object: Float64, group: list[PoseHypothesis], view: View) -> None:
         """Take a detection of a tracked object: fuse it, or let it contest an orientation that it disagrees with."""
@@ -401,7 +407,7 @@ class ObjectTracker:
         """Lead a candidate through the depth images that came since it was worked at."""
         candidate.follow(self._prober, self._since(candidate.reached + 1, but), self.config)
 
-    def _since(self, stamp: int, but: Target | None) -> list[tuple[View, Occluders]]:
+    def _since(self, stamp: int, but: Target | None) -> Views:
         """The kept depth images from a stamp on, with the objects that are believed to stand there, but one."""
         return [(view, self._around(view, but)) for view in self._views if view.stamp >= stamp]
 

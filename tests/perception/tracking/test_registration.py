@@ -1,4 +1,5 @@
 import importlib.util
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -126,3 +127,25 @@ def test_fine_casts_that_would_have_no_rays_are_refused() -> None:
         RegistrationConfig(near=fine)
     with pytest.raises(InvalidValueError, match="repeats=1"):
         RegistrationConfig(finish=Step(gate=0.006, kernel=3.0, edge_reach=5, fine=True, repeats=2))
+
+
+def test_who_has_no_patience_gets_what_the_finish_would_have_started_from() -> None:
+    rng = np.random.default_rng(9)
+    model, world = load_object("relay"), scenes.BenchWorld()
+    T = scenes.on_bench(model, 0.0, 0.1, 0.4)
+    world.add(model, T)
+    depth = apply_depth_noise(world.depth(), None, scenes.INTRINSICS, PRESETS["xtion"], rng)
+    T_start = scenes.displaced(scenes.in_camera(T), 0.004, 1.0, rng)
+
+    def tracked(**changes: object) -> np.ndarray:
+        registration = Registration(replace(RegistrationConfig(), **changes))
+        registration.add(0, tracked_model(model))
+        result = registration.track(depth, scenes.INTRINSICS, {0: T_start})[0]
+        registration.close()
+        return result.T_camera_object
+
+    assert np.array_equal(tracked(patience=0.0), tracked(finish=None))
+    assert np.array_equal(tracked(patience=60.0), tracked())
+    assert not np.array_equal(tracked(patience=0.0), tracked())
+    with pytest.raises(InvalidValueError, match="patience"):
+        RegistrationConfig(patience=-1.0)

@@ -1,6 +1,9 @@
 import importlib.util
 import subprocess
 import sys
+import threading
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +12,10 @@ import pytest
 from simtrack.contracts import NANOSECONDS, PoseHypothesis, Status, TrackStatus
 from simtrack.errors import UnknownNameError
 from simtrack.objects import load_object
+from simtrack.perception.tracking.birth import Prober
+from simtrack.perception.tracking.claims import BEHIND
+from simtrack.perception.tracking.follow_up import Candidate
+from simtrack.perception.tracking.target import TrackerConfig
 from simtrack.perception.tracking.tracker import ObjectTracker
 from simtrack.sensors.depth_noise import PRESETS, apply_depth_noise
 
@@ -24,9 +31,9 @@ COVARIANCE = np.diag([0.03**2] * 3 + [0.2**2] * 3)
 class Film:
     """Feeds a tracker with noisy frames of a bench and detections that come five frames late."""
 
-    def __init__(self, *names: str, seed: int = 0) -> None:
+    def __init__(self, *names: str, seed: int = 0, config: TrackerConfig | None = None) -> None:
         self.models = {name: load_object(name) for name in names}
-        self.tracker = ObjectTracker(self.models)
+        self.tracker = ObjectTracker(self.models, config)
         self.world = scenes.BenchWorld()
         self.rng = np.random.default_rng(seed)
         self.step = 0
@@ -163,6 +170,36 @@ def test_unusable_frames_are_statuses() -> None:
     with pytest.raises(UnknownNameError, match="relay"):
         h = PoseHypothesis("teapot", stamp, np.eye(4), np.eye(6), 1.0, 1.0)
         film.tracker.update(film.world.frame(stamp + PERIOD), scenes.T_MAP_CAMERA, scenes.COVARIANCE, [h])
+    film.tracker.close()
+
+
+def test_live_births_leave_the_frames_little_to_catch_up_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    film = Film("relay", config=TrackerConfig(wait=False))
+    relay = film.put("relay", 0.1, -0.1, 1.0)
+    frames, gate, follow = threading.current_thread(), threading.Event(), Candidate.follow
+    followed: list[tuple[bool, int]] = []
+
+    def noted(candidate: Candidate, prober: Prober, views: Sequence, config: TrackerConfig) -> None:
+        by_frame = threading.current_thread() is frames
+        followed.append((by_frame, len(views)))
+        if not by_frame:
+            assert gate.wait(60.0)
+        follow(candidate, prober, views, config)
+
+    monkeypatch.setattr(Candidate, "follow", noted)
+    while not film.tracker._claims._working:
+        film.run(1)
+    film.run(10)  # meanwhile the thread cannot go on
+    gate.set()
+    result = film.run(1)
+    for _ in range(5):
+        while not all(work._ended for _, _, work in film.tracker._claims._working):
+            time.sleep(0.002)
+        result = film.run(1)
+    assert min(film.error(t, relay) for t in result.tracks) < 0.005
+    by_thread = [count for by_frame, count in followed if not by_frame]
+    assert by_thread[1] >= 10, "what came while it was stuck"
+    assert all(count <= BEHIND for by_frame, count in followed if by_frame)
     film.tracker.close()
 
 
