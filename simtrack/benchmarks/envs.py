@@ -98,7 +98,7 @@ def _simulate(env: gym.Env, actions: Sequence[Float32], seed: int, on: bool) -> 
     with Simulation(
         inner.scene, BUILDING_SEED, settings.renderer, settings.camera, settings.lidar,
         sensors=sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
-        scan_key=SCAN_KEY, servo=KEY_NS, key=KEY,
+        scan_key=SCAN_KEY, servo=KEY_NS, key=KEY, threads=False,
     ) as simulation:  # fmt: skip
         simulation.restart(seed)
         for action in actions:

@@ -63,7 +63,7 @@ class Loop:
         self.simulation = Simulation(
             scene, BUILDING_SEED, settings.renderer, camera, settings.lidar,
             sensors=settings.sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
-            scan_key=SCAN_KEY, servo=KEY_NS, key=KEY,
+            scan_key=SCAN_KEY, servo=KEY_NS, key=KEY, threads=False,
         )  # fmt: skip
         self.manipulator = Manipulator(self.simulation) if scene.robot.suction else None
         """Arm and cup, where there is one."""

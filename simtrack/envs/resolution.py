@@ -7,14 +7,17 @@ from simtrack.perception.pipeline import StackConfig
 from simtrack.perception.tracking.registration_config import RegistrationConfig, Step
 from simtrack.sensors.depth_noise import PRESETS
 
-LIDAR_SEGMENTS = 5
+LIDAR_SEGMENTS = 3
 """Every how many-th scan is segmented: what stands in the way of a robot stands there for longer than half a second."""
 FEWEST_RAYS, FEWEST_EDGES = 8, 4
 """However small an image is, so many rays must confirm a pose, and so many silhouette pixels a new object."""
 
 
 def stack_config(scale: float) -> StackConfig:
-    """Settings for images with `scale` times as many pixels a radian: lengths and areas in pixels follow."""
+    """Settings for images with `scale` times as many pixels a radian: lengths and areas in pixels follow.
+
+    No threads: environments are many, and each has a processor at most.
+    """
     stack = StackConfig()
     tracker, fit, seen = stack.tracker, stack.tracker.fit, stack.presegmentation
     fit = replace(
@@ -27,6 +30,7 @@ def stack_config(scale: float) -> StackConfig:
         registration=_registration(tracker.registration, scale),
         fit=fit,
         min_rays=max(FEWEST_RAYS, round(tracker.min_rays * min(scale * 2.0, 1.0))),
+        threads=False,
     )
     seen = replace(
         seen,
@@ -37,7 +41,12 @@ def stack_config(scale: float) -> StackConfig:
     )
     joints = replace(stack.articulation, registration=tracker.registration)
     return replace(
-        stack, tracker=tracker, articulation=joints, presegmentation=seen, lidar_presegmentation_every=LIDAR_SEGMENTS
+        stack,
+        tracker=tracker,
+        articulation=joints,
+        presegmentation=seen,
+        lidar_presegmentation_every=LIDAR_SEGMENTS,
+        threads=False,
     )
 
 

@@ -22,6 +22,7 @@ from simtrack.errors import FileFormatError, InvalidValueError, RenderingError, 
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import inverse, rotation_from_rpy, transform, transform_planar
 from simtrack.objects import ObjectModel, TrackerModelConfig, tracker_model
+from simtrack.perception.beside import AtOnce
 from simtrack.raycast import RayBundle
 from simtrack.sensors.camera import XTION, CameraModel
 from simtrack.sensors.faults import CalibrationFaults, FaultyFeed, FeedFaults
@@ -74,6 +75,7 @@ class Simulation:
         scan_key: int = KEY_NS,
         servo: int = TIMESTEP_NS,
         key: int = KEY_NS,
+        threads: bool = True,
     ) -> None:
         """Build the world of `scene` for `seed` and let it settle; stamp 0 is the moment after.
 
@@ -90,6 +92,7 @@ class Simulation:
             scan_key: nanoseconds between the moments of a lidar's turn that its motion is interpolated from.
             servo: nanoseconds between the setpoints of robot and hand: a physics step, or two.
             key: nanoseconds between the states that are remembered; those in between are interpolated.
+            threads: lidar and noise have a thread of their own, where that saves time; frames are the same without.
 
         Raises:
             SimtrackError: whatever is wrong with the scene; see `build_world`.
@@ -112,7 +115,7 @@ class Simulation:
         self._data = self.world.data
         self._scratch = mujoco.MjData(self.world.model)
         self._scan_scratch = mujoco.MjData(self.world.model)
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="simtrack-sensors")
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="simtrack-sensors") if threads else AtOnce()
         self._history = History(self.world.model, memory, key)
         self._rays = WorldRays(self.world)
         self.truth = GroundTruth(self.world, self._history, self._rays, intrinsics)
