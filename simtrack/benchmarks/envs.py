@@ -15,10 +15,9 @@ import numpy as np
 from simtrack.benchmarks.harness import Benchmark, Options, Timing
 from simtrack.benchmarks.yardstick import REFERENCE, scaled, yardstick
 from simtrack.contracts import Float32
-from simtrack.envs.loop import BUILDING_SEED, KEY, MEMORY, SCAN_KEY
+from simtrack.envs.loop import BUILDING_SEED, KEY, MEMORY, SCAN_KEY, SERVO
 from simtrack.envs.policies import make_policy
 from simtrack.envs.wrappers import simtrack_env
-from simtrack.simulation.history import KEY_NS
 from simtrack.simulation.simulation import Simulation
 
 ASKED = {"state": 150.0, "belief": 60.0, "rgbd": 80.0}
@@ -98,7 +97,7 @@ def _simulate(env: gym.Env, actions: Sequence[Float32], seed: int, on: bool) -> 
     with Simulation(
         inner.scene, BUILDING_SEED, settings.renderer, settings.camera, settings.lidar,
         sensors=sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
-        scan_key=SCAN_KEY, servo=KEY_NS, key=KEY, threads=False,
+        scan_key=SCAN_KEY, servo=SERVO, key=KEY, threads=False,
     ) as simulation:  # fmt: skip
         simulation.restart(seed)
         for action in actions:

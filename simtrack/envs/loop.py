@@ -16,7 +16,6 @@ from simtrack.perception.localization import MeshLocalizer
 from simtrack.perception.pipeline import PerceptionStack
 from simtrack.sensors.depth_noise import PRESETS
 from simtrack.simulation.ground_truth import Truth
-from simtrack.simulation.history import KEY_NS
 from simtrack.simulation.oracles import OracleDetector
 from simtrack.simulation.scene_file import SceneFile
 from simtrack.simulation.simulation import Simulation
@@ -27,6 +26,8 @@ KEY = 20_000_000
 """Nanoseconds between the states that are remembered: all sensors look at multiples of it."""
 SCAN_KEY = 50_000_000
 """Nanoseconds between the moments of a lidar's turn: at 1 m/s^2 a straight line between them errs by 0.3 mm."""
+SERVO = 10_000_000
+"""Nanoseconds between the setpoints of robot and hand."""
 MEMORY = 2_000_000_000
 """Nanoseconds of the past that are kept."""
 
@@ -63,7 +64,7 @@ class Loop:
         self.simulation = Simulation(
             scene, BUILDING_SEED, settings.renderer, camera, settings.lidar,
             sensors=settings.sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
-            scan_key=SCAN_KEY, servo=KEY_NS, key=KEY, threads=False,
+            scan_key=SCAN_KEY, servo=SERVO, key=KEY, threads=False,
         )  # fmt: skip
         self.manipulator = Manipulator(self.simulation) if scene.robot.suction else None
         """Arm and cup, where there is one."""

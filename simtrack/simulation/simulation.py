@@ -90,7 +90,7 @@ class Simulation:
             memory: nanoseconds of the past that `truth` can be asked about at least; all of it if None.
             proprioception: nanoseconds between odometry readings and between joint states.
             scan_key: nanoseconds between the moments of a lidar's turn that its motion is interpolated from.
-            servo: nanoseconds between the setpoints of robot and hand: a physics step, or two.
+            servo: nanoseconds between the setpoints of robot and hand: physics steps of which some fill a `key`.
             key: nanoseconds between the states that are remembered; those in between are interpolated.
             threads: lidar and noise have a thread of their own, where that saves time; frames are the same without.
 
@@ -99,10 +99,10 @@ class Simulation:
         """
         import mujoco
 
-        if servo not in (TIMESTEP_NS, KEY_NS):
-            raise InvalidValueError("servo", servo, f"{TIMESTEP_NS} or {KEY_NS} ns")
         if key < KEY_NS or key % KEY_NS:
             raise InvalidValueError("key", key, f"a multiple of {KEY_NS} ns")
+        if servo < TIMESTEP_NS or servo % TIMESTEP_NS or key % servo:
+            raise InvalidValueError("servo", servo, f"a multiple of {TIMESTEP_NS} ns that divides the key, {key} ns")
         if unknown := sorted(set(sensors) - set(SENSORS)):
             raise UnknownNameError("sensor", unknown[0], SENSORS)
         self.scene, self.seed = scene, seed
