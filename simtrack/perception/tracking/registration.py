@@ -138,7 +138,7 @@ class Registration:
         self._marks[:] = 0
         self._follow(batch, (config.near,), np.ones(len(batch.instances), bool))
         # What no ray met is hidden: nothing tells where it is.
-        far = ~batch.near(predicted, config) # & (batch.counts[:, kernels.SUPPORTED :].sum(axis=1) > 0)
+        far = ~batch.near(predicted, config) & (batch.counts[:, kernels.SUPPORTED :].sum(axis=1) > 0)
         if far.any():
             batch.poses[far] = predicted[far]
             self._follow(batch, config.track_schedule, far)
