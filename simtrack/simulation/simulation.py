@@ -344,7 +344,7 @@ class Simulation:
         depth = apply_depth_noise(exact, None, self.camera.intrinsics, self.depth_noise, self._rng_depth, draws=draws)
         rgb = self._renderer.rgb(self._scratch) if want_rgb else None
         joints = self._encoders(self._history.qpos(stamp), stamp, self._rng_camera_pose)
-        believed = self.robot.forward(dict(zip(joints.names, joints.positions.tolist(), strict=True)))["camera"]
+        believed = self.robot.pose("camera", dict(zip(joints.names, joints.positions.tolist(), strict=True)))
         sequence = self._counts["camera"] - 1
         return RgbdFrame(stamp, depth, rgb, self.camera.intrinsics, believed, sequence)
 
