@@ -1,8 +1,8 @@
 """``simtrack bench envs``: steps a second of the environments by observation mode, and what a step is spent on.
 
-A step is a tenth of a second: 50 steps of physics. CPU time counts, because machines are shared. Physics is
-the same simulation with all sensors off, sensing what the sensors add to it, and the rest of a step is perception (the
-stack, or ideal perception), reward and arrays.
+A step is a tenth of a second: 50 steps of physics. CPU time counts, because machines are shared; means do, because
+lidar and detector have their turn in every second step. Physics is the same simulation with all sensors off, sensing what
+the sensors add to it, and the rest of a step is perception (the stack, or ideal perception), reward and arrays.
 """
 
 import statistics
@@ -56,7 +56,7 @@ def _measure(result: Benchmark, env_id: str, name: str, mode: str, asked: float,
     prefix = f"{name}, {mode}"
     result.add(
         f"{prefix}: steps a second", whole, 1.0 / whole.cpu, unit="1/s CPU", asked=asked, sense="at least",
-        note=f"median of {steps} steps",
+        note=f"mean of {steps} steps",
     )  # fmt: skip
     result.add(f"{prefix}: physics", value=1e3 * physics, unit="ms CPU")
     result.add(f"{prefix}: sensors and rendering", value=1e3 * (sensing - physics), unit="ms CPU")
@@ -83,11 +83,11 @@ def _play(env: gym.Env, mode: str, steps: int, seed: int) -> tuple[Timing, list[
         if terminated or truncated:
             observation, _ = env.reset(seed=seed)
             policy.begin(np.random.default_rng(seed))
-    return Timing(statistics.median(cpu[WARM_UP:]), statistics.median(wall[WARM_UP:]), steps), actions
+    return Timing(statistics.fmean(cpu[WARM_UP:]), statistics.fmean(wall[WARM_UP:]), steps), actions
 
 
 def _simulate(env: gym.Env, actions: Sequence[Float32], seed: int, on: bool) -> float:
-    """Median CPU seconds of the simulation alone under the same actions, its sensors on or off."""
+    """Mean CPU seconds of the simulation alone under the same actions, its sensors on or off."""
     inner = simtrack_env(env)
     settings, steering = inner.settings, inner.steering
     sensors = settings.sensors if on else ()
@@ -105,4 +105,4 @@ def _simulate(env: gym.Env, actions: Sequence[Float32], seed: int, on: bool) -> 
             started = time.process_time()
             simulation.advance(command, want_rgb=colours)
             times.append(time.process_time() - started)
-    return statistics.median(times[WARM_UP:])
+    return statistics.fmean(times[WARM_UP:])
