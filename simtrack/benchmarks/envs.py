@@ -1,8 +1,8 @@
 """``simtrack bench envs``: steps a second of the environments by observation mode, and what a step is spent on.
 
 A step is a tenth of a second: 50 steps of physics. CPU time counts, because machines are shared; means do, because
-lidar and detector have their turn in every second step. Physics is the same simulation with all sensors off, sensing what
-the sensors add to it, and the rest of a step is perception (the stack, or ideal perception), reward and arrays.
+lidar and detector have their turn in every second step. Physics is the same simulation with all sensors off, sensing
+what the sensors add to it, and the rest of a step is perception (the stack, or ideal perception), reward and arrays.
 """
 
 import statistics

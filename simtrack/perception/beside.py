@@ -9,16 +9,21 @@ first frame that finds it. Then beliefs do depend on the machine.
 Where there is one processor for each of many stacks, threads only cost: `worker` gives one that works at once.
 """
 
+import os
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from threading import Condition
 from typing import Any, Generic, TypeVar
 
 from simtrack.contracts import NANOSECONDS
 from simtrack.errors import InvalidValueError
 
 T = TypeVar("T")
+
+
+NICENESS = 10
+"""Of work that no frame waits for: where processors are short, the frames go first."""
 
 
 class AtOnce(Executor):
@@ -34,17 +39,29 @@ class AtOnce(Executor):
         return future
 
 
-def worker(name: str, threads: bool = True) -> Executor:
+def worker(name: str, wait: bool = True, threads: bool = True) -> Executor:
     """A thread for work beside the frames, made at first use; compiled kernels run in it on one thread each.
 
-    Kernels release the interpreter lock, so it is a second processor that does the work. Without `threads` the calling
-    thread does it, when it is begun; answers are the same.
+    Kernels release the interpreter lock, so it is a second processor that does the work.
+
+    Args:
+        name: of the thread.
+        wait: whether frames wait for the work; if not, it leaves the processor to them.
+        threads: if not, the calling thread does the work when it is begun; answers are the same.
     """
     if not threads:
         return AtOnce()
+    return ThreadPoolExecutor(1, f"simtrack-{name}", _settle_down, (-20 if wait else NICENESS,))
+
+
+def _settle_down(least_niceness: int) -> None:
+    """Prepare the calling thread for work beside the frames."""
     import numba
 
-    return ThreadPoolExecutor(1, f"simtrack-{name}", numba.set_num_threads, (1,))
+    numba.set_num_threads(1)
+    if hasattr(os, "setpriority"):
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, max(least_niceness, os.getpriority(os.PRIO_PROCESS, thread)))
 
 
 class Beside(Generic[T]):
@@ -76,6 +93,11 @@ class Beside(Generic[T]):
         if self._work is None or stamp - self._work[0] < self._period:
             return False
         return self._wait or self._work[1].done()
+
+    @property
+    def keeps_waiting(self) -> bool:
+        """Whether settling now would have to wait, though nobody is to wait for this piece."""
+        return not self._wait and self._work is not None and not self._work[1].done()
 
     def settle(self) -> T:
         """End the piece and give its answer; waits for it if need be. Raises what the work raised."""
@@ -112,7 +134,7 @@ class Paced(Generic[T]):
             wait: see the module.
         """
         self._step, self._wait = round(seconds * NANOSECONDS), wait
-        self._steps, self._ended, self._changed = 0, False, Condition()
+        self._steps, self._ended, self._changed = 0, False, threading.Condition()
         self._future = thread.submit(self._run, work)
 
     def _run(self, work: Callable[[Callable[[], None]], T]) -> T:

@@ -42,7 +42,7 @@ class Presegmenter:
             threads: likewise.
         """
         self._believed, self._body, self._config = believed, body, config
-        self._thread = worker("presegmentation", threads)
+        self._thread = worker("presegmentation", wait, threads)
         self.image = Beside[Presegmentation](self._thread, image_time, wait)
         self.scan = Beside[Presegmentation](self._thread, scan_time, wait)
 

@@ -76,7 +76,7 @@ class DetectorRunner:
             return None
         self.status, self._free_at = result.status, max(result.available, frame.stamp + 1)
         if self._solver is None:
-            self._solver = worker("pnp", self._threads)
+            self._solver = worker("pnp", threads=self._threads)
         # Until the answer is due there is time to solve for the poses.
         self._waiting.append((result, self._solver.submit(self._hypotheses, result, frame.intrinsics)))
         return result
