@@ -13,7 +13,7 @@ from simtrack.envs.resolution import noise_in_small_images, stack_config
 from simtrack.envs.settings import Settings, pixel_scale
 from simtrack.envs.truth import IdealPerception, true_belief
 from simtrack.perception.localization import MeshLocalizer
-from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.pipeline import PerceptionStack, StackConfig
 from simtrack.sensors.depth_noise import PRESETS
 from simtrack.simulation.ground_truth import Truth
 from simtrack.simulation.oracles import OracleDetector
@@ -107,7 +107,7 @@ class Loop:
             simulation.robot,
             OracleDetector(simulation.truth, simulation.models, seed, errors),
             T_map_base=simulation.start,
-            config=stack_config(pixel_scale(simulation.camera)),
+            config=_without_threads(stack_config(pixel_scale(simulation.camera))),
         )
 
     @property
@@ -161,6 +161,11 @@ class Loop:
         """Release everything; may be called twice."""
         self._end_stack()
         self.simulation.close()
+
+
+def _without_threads(config: StackConfig) -> StackConfig:
+    """The same settings for one processor: environments are many, and none has more."""
+    return replace(config, threads=False, tracker=replace(config.tracker, threads=False))
 
 
 def _with_noise(scene: SceneFile, scale: float) -> SceneFile:

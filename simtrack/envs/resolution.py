@@ -14,10 +14,7 @@ FEWEST_RAYS, FEWEST_EDGES = 8, 4
 
 
 def stack_config(scale: float) -> StackConfig:
-    """Settings for images with `scale` times as many pixels a radian: lengths and areas in pixels follow.
-
-    No threads: environments are many, and each has a processor at most.
-    """
+    """Settings for images with `scale` times as many pixels a radian: lengths and areas in pixels follow."""
     stack = StackConfig()
     tracker, fit, seen = stack.tracker, stack.tracker.fit, stack.presegmentation
     fit = replace(
@@ -30,7 +27,6 @@ def stack_config(scale: float) -> StackConfig:
         registration=_registration(tracker.registration, scale),
         fit=fit,
         min_rays=max(FEWEST_RAYS, round(tracker.min_rays * min(scale * 2.0, 1.0))),
-        threads=False,
     )
     seen = replace(
         seen,
@@ -46,7 +42,6 @@ def stack_config(scale: float) -> StackConfig:
         articulation=joints,
         presegmentation=seen,
         lidar_presegmentation_every=LIDAR_SEGMENTS,
-        threads=False,
     )
 
 
