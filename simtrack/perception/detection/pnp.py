@@ -82,7 +82,7 @@ def solve_pose(
             break
         if any(angle_between(T[:3, :3], h.T_camera_object[:3, :3]) < config.distinct_angle for h in hypotheses):
             continue
-        covariance = kernels.covariance(T, points, sigma, camera) * config.error_correlation
+        covariance = config.error_correlation * np.asarray(kernels.covariance(T, points, sigma, camera), np.float64)
         hypotheses.append(PoseHypothesis(detection.class_name, stamp, T, covariance, error, detection.score))
     return hypotheses
 
