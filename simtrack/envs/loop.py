@@ -13,10 +13,9 @@ from simtrack.envs.resolution import noise_in_small_images, stack_config
 from simtrack.envs.settings import Settings, pixel_scale
 from simtrack.envs.truth import IdealPerception, true_belief
 from simtrack.perception.localization import MeshLocalizer
-from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.pipeline import PerceptionStack, StackConfig
 from simtrack.sensors.depth_noise import PRESETS
 from simtrack.simulation.ground_truth import Truth
-from simtrack.simulation.history import KEY_NS
 from simtrack.simulation.oracles import OracleDetector
 from simtrack.simulation.scene_file import SceneFile
 from simtrack.simulation.simulation import Simulation
@@ -27,6 +26,8 @@ KEY = 20_000_000
 """Nanoseconds between the states that are remembered: all sensors look at multiples of it."""
 SCAN_KEY = 50_000_000
 """Nanoseconds between the moments of a lidar's turn: at 1 m/s^2 a straight line between them errs by 0.3 mm."""
+SERVO = 10_000_000
+"""Nanoseconds between the setpoints of robot and hand."""
 MEMORY = 2_000_000_000
 """Nanoseconds of the past that are kept."""
 
@@ -63,7 +64,7 @@ class Loop:
         self.simulation = Simulation(
             scene, BUILDING_SEED, settings.renderer, camera, settings.lidar,
             sensors=settings.sensors, sleep=True, memory=MEMORY, proprioception=settings.proprioception,
-            scan_key=SCAN_KEY, servo=KEY_NS, key=KEY,
+            scan_key=SCAN_KEY, servo=SERVO, key=KEY, threads=False,
         )  # fmt: skip
         self.manipulator = Manipulator(self.simulation) if scene.robot.suction else None
         """Arm and cup, where there is one."""
@@ -106,7 +107,7 @@ class Loop:
             simulation.robot,
             OracleDetector(simulation.truth, simulation.models, seed, errors),
             T_map_base=simulation.start,
-            config=stack_config(pixel_scale(simulation.camera)),
+            config=_without_threads(stack_config(pixel_scale(simulation.camera))),
         )
 
     @property
@@ -160,6 +161,11 @@ class Loop:
         """Release everything; may be called twice."""
         self._end_stack()
         self.simulation.close()
+
+
+def _without_threads(config: StackConfig) -> StackConfig:
+    """The same settings for one processor: environments are many, and none has more."""
+    return replace(config, threads=False, tracker=replace(config.tracker, threads=False))
 
 
 def _with_noise(scene: SceneFile, scale: float) -> SceneFile:

@@ -291,7 +291,7 @@ def decode(arrays: Arrays, layout: Layout, robot: KinematicTree) -> tuple[Belief
     covariance = np.diag(np.square([deviation[0], deviation[1], 0.0, 0.0, 0.0, deviation[2]]))
     status = ANSWERS[answer] if answer < len(ANSWERS) else Status.NO_DATA
     joints = JointState(stamp, JOINTS, arrays["joints"].astype(float))
-    T_map_camera = T_map_base @ robot.forward(dict(zip(JOINTS, joints.positions.tolist(), strict=True)))[CAMERA]
+    T_map_camera = T_map_base @ robot.pose(CAMERA, dict(zip(JOINTS, joints.positions.tolist(), strict=True)))
     tracks = tuple(_track(arrays, int(slot), layout, stamp, T_map_camera) for slot in np.flatnonzero(arrays["mask"]))
     localization = Localization(stamp, T_map_base, covariance, status)
     seen = _regions(arrays, stamp)

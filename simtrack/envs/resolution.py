@@ -7,7 +7,7 @@ from simtrack.perception.pipeline import StackConfig
 from simtrack.perception.tracking.registration_config import RegistrationConfig, Step
 from simtrack.sensors.depth_noise import PRESETS
 
-LIDAR_SEGMENTS = 5
+LIDAR_SEGMENTS = 3
 """Every how many-th scan is segmented: what stands in the way of a robot stands there for longer than half a second."""
 FEWEST_RAYS, FEWEST_EDGES = 8, 4
 """However small an image is, so many rays must confirm a pose, and so many silhouette pixels a new object."""
@@ -37,7 +37,11 @@ def stack_config(scale: float) -> StackConfig:
     )
     joints = replace(stack.articulation, registration=tracker.registration)
     return replace(
-        stack, tracker=tracker, articulation=joints, presegmentation=seen, lidar_presegmentation_every=LIDAR_SEGMENTS
+        stack,
+        tracker=tracker,
+        articulation=joints,
+        presegmentation=seen,
+        lidar_presegmentation_every=LIDAR_SEGMENTS,
     )
 
 

@@ -15,11 +15,14 @@ from simtrack.sensors.lidar import VLP16, LidarModel
 from simtrack.simulation.oracles.detector import OracleDetectorConfig
 from simtrack.simulation.rendering import RENDERERS
 from simtrack.simulation.scene_file import SceneFile, parse_scene
-from simtrack.simulation.simulation import PROPRIOCEPTION_NS
 
 CONTROL_HZ = 10
-"""Steps a second of simulated time; camera and lidar look as often."""
+"""Steps a second of simulated time; the camera looks as often."""
 CONTROL_NS = 1_000_000_000 // CONTROL_HZ
+LIDAR_HZ = 5
+"""Turns of the lidar a second, the slowest of a VLP-16: odometry leads on in between."""
+ODOMETRY_NS = 40_000_000
+"""Nanoseconds between readings of wheels and joints where a localizer needs them."""
 DETECTORS = ("oracle",)
 BELIEF_SIZE, IMAGE_SIZE = (160, 120), (84, 84)
 """Width and height of the robot's camera where a stack looks at it, and where only the agent does."""
@@ -89,9 +92,9 @@ class Settings:
 
     @property
     def lidar(self) -> LidarModel:
-        """The VLP-16 with fewer firings a turn, one turn a step."""
-        period = 1.0 / (CONTROL_HZ * self.lidar_columns)
-        return LidarModel(rate_hz=float(CONTROL_HZ), firing_period=period)
+        """The VLP-16 with fewer firings a turn, one turn in two steps."""
+        period = 1.0 / (LIDAR_HZ * self.lidar_columns)
+        return LidarModel(rate_hz=float(LIDAR_HZ), firing_period=period)
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -105,8 +108,8 @@ class Settings:
 
     @property
     def proprioception(self) -> int:
-        """Nanoseconds between readings of wheels and joints: a localizer wants 50 a second, an agent one a step."""
-        return PROPRIOCEPTION_NS if "belief" in self.modes else CONTROL_NS
+        """Nanoseconds between readings of wheels and joints: a localizer wants some a step, an agent one."""
+        return ODOMETRY_NS if "belief" in self.modes else CONTROL_NS
 
     def detector_config(self, scale: float) -> OracleDetectorConfig:
         """Errors of the oracle detector; sizes in pixels are multiplied by `scale`, as the images are."""

@@ -61,14 +61,29 @@ class KinematicTree:
         """Link name -> (4, 4) T_root_link for joint positions in rad or m; joints not named are at zero."""
         poses: dict[str, Float64] = {}
         for link in self.links:
-            if link.joint is None:
-                poses[link.name] = np.eye(4)
-                continue
-            value = float(positions.get(link.joint.name, 0.0))
-            motion = np.eye(4)
-            if link.joint.kind == "revolute":
-                motion[:3, :3] = exp_so3(value * link.joint.axis)
-            elif link.joint.kind == "prismatic":
-                motion = transform(translation=value * link.joint.axis)
-            poses[link.name] = poses[link.parent] @ link.T_parent_joint @ motion
+            poses[link.name] = _placed(link, poses, positions)
         return poses
+
+    def pose(self, name: str, positions: Mapping[str, float]) -> Float64:
+        """(4, 4) T_root_link of one link, see `forward`."""
+        links = {link.name: link for link in self.links}
+        chain = [links[name]]
+        while chain[-1].parent:
+            chain.append(links[chain[-1].parent])
+        poses: dict[str, Float64] = {}
+        for link in reversed(chain):
+            poses[link.name] = _placed(link, poses, positions)
+        return poses[name]
+
+
+def _placed(link: Link, poses: Mapping[str, Float64], positions: Mapping[str, float]) -> Float64:
+    """(4, 4) T_root_link of a link below those whose poses are known."""
+    if link.joint is None:
+        return np.eye(4)
+    T = poses[link.parent] @ link.T_parent_joint
+    value = float(positions.get(link.joint.name, 0.0))
+    if link.joint.kind == "revolute":
+        return T @ transform(exp_so3(value * link.joint.axis))
+    if link.joint.kind == "prismatic":
+        return T @ transform(translation=value * link.joint.axis)
+    return T

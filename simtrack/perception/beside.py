@@ -5,14 +5,16 @@ follows from the stamps alone. Where the machine is fast enough the answer is th
 
 A robot that cannot wait hands over ``wait=False``: an answer that is not there when its time is up is taken up by the
 first frame that finds it. Then beliefs do depend on the machine.
+
+Where there is one processor for each of many stacks, threads only cost: `worker` gives one that works at once.
 """
 
 import os
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Generic, TypeVar
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from typing import Any, Generic, TypeVar
 
 from simtrack.contracts import NANOSECONDS
 from simtrack.errors import InvalidValueError
@@ -24,7 +26,20 @@ NICENESS = 10
 """Of work that no frame waits for: where processors are short, the frames go first."""
 
 
-def worker(name: str, wait: bool = True) -> ThreadPoolExecutor:
+class AtOnce(Executor):
+    """Does what it is given before it returns, in the calling thread."""
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """The answer, which is there already."""
+        future: Future[T] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:  # as a thread would keep it for the one who asks
+            future.set_exception(error)
+        return future
+
+
+def worker(name: str, wait: bool = True, threads: bool = True) -> Executor:
     """A thread for work beside the frames, made at first use; compiled kernels run in it on one thread each.
 
     Kernels release the interpreter lock, so it is a second processor that does the work.
@@ -32,7 +47,10 @@ def worker(name: str, wait: bool = True) -> ThreadPoolExecutor:
     Args:
         name: of the thread.
         wait: whether frames wait for the work; if not, it leaves the processor to them.
+        threads: if not, the calling thread does the work when it is begun; answers are the same.
     """
+    if not threads:
+        return AtOnce()
     return ThreadPoolExecutor(1, f"simtrack-{name}", _settle_down, (-20 if wait else NICENESS,))
 
 
@@ -52,7 +70,7 @@ class Beside(Generic[T]):
     Several may share a thread: it does their pieces one after the other, in the order in which they were begun.
     """
 
-    def __init__(self, thread: ThreadPoolExecutor, seconds: float, wait: bool = True) -> None:
+    def __init__(self, thread: Executor, seconds: float, wait: bool = True) -> None:
         if not seconds >= 0.0:
             raise InvalidValueError("seconds", seconds, ">= 0 s")
         self._thread, self._period, self._wait = thread, round(seconds * NANOSECONDS), wait
@@ -102,7 +120,7 @@ class Paced(Generic[T]):
 
     def __init__(
         self,
-        thread: ThreadPoolExecutor,
+        thread: Executor,
         seconds: float,
         work: Callable[[Callable[[], None]], T],
         wait: bool = True,

@@ -96,6 +96,8 @@ class StackConfig:
     """What is segmented beside the frames is used this long after it was begun, likewise."""
     wait: bool = True
     """Frames wait for what is due and not there yet, so that beliefs are the same on every machine; `live` does not."""
+    threads: bool = True
+    """What is done beside the frames is done by threads of its own; else at once, with the same answers."""
 
     @staticmethod
     def live() -> "StackConfig":
@@ -154,8 +156,9 @@ class PerceptionStack:
             c.segmentation_time,
             c.segmentation_time,
             c.wait,
+            c.threads,
         )
-        self._correction_thread = worker("localization", c.wait)
+        self._correction_thread = worker("localization", c.wait, c.threads)
         self._correction = Beside[Localization](self._correction_thread, c.correction_time, c.wait)
         self.localizer = localizer or self._mesh_localizer(static_map, T_map_base)
         self.tracker = tracker or ObjectTracker(models, self.config.tracker)
@@ -164,7 +167,7 @@ class PerceptionStack:
         )
         self.graph = SceneGraph(static_map, models, self.config.scene_graph)
         self._relations = scene_graph
-        self.detections = DetectorRunner(detector, models, self.config.runner)
+        self.detections = DetectorRunner(detector, models, self.config.runner, c.threads)
         self.on_detection: Callable[[DetectionResult], None] | None = None
         """Called with every answer of the detector as it is given (recorders listen here)."""
         self._joints: deque[JointState] = deque(maxlen=64)

@@ -28,6 +28,7 @@ class Presegmenter:
         image_time: float,
         scan_time: float,
         wait: bool = True,
+        threads: bool = True,
     ) -> None:
         """Start idle.
 
@@ -38,9 +39,10 @@ class Presegmenter:
             image_time: an image's answer is taken up so many seconds of the sensor's clock after it was begun.
             scan_time: likewise.
             wait: see `simtrack.perception.beside`.
+            threads: likewise.
         """
         self._believed, self._body, self._config = believed, body, config
-        self._thread = worker("presegmentation", wait)
+        self._thread = worker("presegmentation", wait, threads)
         self.image = Beside[Presegmentation](self._thread, image_time, wait)
         self.scan = Beside[Presegmentation](self._thread, scan_time, wait)
 

@@ -147,12 +147,13 @@ class SelfFilter:
         if posture == self._posture:
             return
         self._posture = posture
-        for name, T_base_link in self.robot.forward(positions).items():
-            if name in self._links and self._moved(name, T_base_link):
-                self._scene.set_pose(self._links[name], T_base_link)
-                self._placed[name] = T_base_link
-                if self._turn is not None:
-                    self._turn.body = None
+        poses = self.robot.forward(positions)
+        moved = {name: poses[name] for name in self._links if name in poses and self._moved(name, poses[name])}
+        if moved:
+            self._scene.set_poses([self._links[name] for name in moved], np.array(list(moved.values())))
+            self._placed.update(moved)
+            if self._turn is not None:
+                self._turn.body = None
 
     def _moved(self, name: str, T_base_link: Float64) -> bool:
         """Whether some point of a link may be farther than the tolerance from where it was placed."""

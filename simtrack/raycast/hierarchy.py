@@ -58,7 +58,7 @@ class Hierarchy:
         for number in numbers[~table.enabled[numbers]].tolist():
             self.show(number)
         for number in self._motions.keys() & set(numbers.tolist()):
-            self.set_off(number)
+            self.set_off(np.array([number]), self._motions[number][None])
 
     def detach(self, numbers: npt.NDArray[np.int64]) -> None:
         """Take instances out; the ground too may be among them."""
@@ -75,16 +75,11 @@ class Hierarchy:
         held = numbers[self._table.handles[numbers] != 0]
         instancing.move(self._table.handles[held], instancing.columns(self._table.poses[held]))
 
-    def set_off(self, number: int) -> None:
-        """Tell of an instance's motion."""
-        geometry, keys = int(self._table.handles[number]), self._motions[number]
-        if geometry:
-            api = rtc.embree().api
-            api.rtcSetGeometryTimeStepCount(geometry, len(keys))
-            for step, columns in enumerate(instancing.columns(keys)):
-                layout = rtc.RTC_FORMAT_FLOAT3X4_COLUMN_MAJOR
-                api.rtcSetGeometryTransform(geometry, step, layout, columns.ctypes.data)
-            api.rtcCommitGeometry(geometry)
+    def set_off(self, numbers: npt.NDArray[np.int64], keys: Float64) -> None:
+        """Tell of the motion of instances (N,) through as many keys (N, K, 4, 4) each."""
+        held = self._table.handles[numbers] != 0
+        transforms = instancing.columns(keys[held].reshape(-1, 4, 4)).reshape(-1, keys.shape[1], 12)
+        instancing.set_off(self._table.handles[numbers[held]], transforms)
 
     def show(self, number: int) -> None:
         """Tell whether an instance is enabled."""

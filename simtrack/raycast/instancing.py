@@ -50,6 +50,18 @@ def move(geometries, transforms):
 
 
 @njit(cache=True, nogil=True)
+def set_off(geometries, transforms):
+    """Let instances (N,) move through `transforms` (N, K, 12) at equidistant times from 0 to 1."""
+    count = transforms.shape[1]
+    for k in range(geometries.shape[0]):
+        _rtcSetGeometryTimeStepCount(geometries[k], np.uint32(count))
+        for step in range(count):
+            address = transforms.ctypes.data + 48 * (k * count + step)
+            _rtcSetGeometryTransform(geometries[k], np.uint32(step), _COLUMNS, address)
+        _rtcCommitGeometry(geometries[k])
+
+
+@njit(cache=True, nogil=True)
 def detach(top, numbers):
     """Take instances out of a scene."""
     for k in range(numbers.shape[0]):

@@ -162,17 +162,30 @@ class RayScene:
             T_keys: (K, 4, 4) T_map_mesh at K = 1..129 equidistant times from 0 to 1; between them the matrices are
                 interpolated linearly, element by element (so keys of a rotating body must be close to one another).
         """
-        keys = checked_poses(T_keys, "T_keys")
-        if not 1 <= len(keys) <= rtc.RTC_MAX_TIME_STEP_COUNT:
-            raise InvalidValueError("T_keys", keys.shape, f"1..{rtc.RTC_MAX_TIME_STEP_COUNT} keys")
+        self.set_motions((instance,), checked_poses(T_keys, "T_keys")[None])
+
+    def set_motions(self, instances: Sequence[int], T_keys: Float64) -> None:
+        """Let several instances move at once, see `set_motion`; `T_keys` (N, K, 4, 4).
+
+        If one is unknown, none is set off.
+        """
+        if not len(instances):
+            return
+        if T_keys.ndim != 4 or len(T_keys) != len(instances):
+            raise InvalidValueError("T_keys", T_keys.shape, f"({len(instances)}, K, 4, 4)")
+        count = T_keys.shape[1]
+        if not 1 <= count <= rtc.RTC_MAX_TIME_STEP_COUNT:
+            raise InvalidValueError("T_keys", T_keys.shape, f"1..{rtc.RTC_MAX_TIME_STEP_COUNT} keys")
+        keys = checked_poses(T_keys.reshape(-1, *T_keys.shape[2:]), "T_keys").reshape(len(instances), count, 4, 4)
         with self._lock:
-            self.set_poses((instance,), keys[:1])
-            if len(keys) > 1:
-                self._motions[instance] = keys
-                self._table.set_off(instance)
+            self.set_poses(instances, keys[:, 0])
+            if count > 1:
+                numbers = np.array(instances, np.int64)
+                self._motions.update(zip(numbers.tolist(), keys, strict=True))
+                self._table.set_off(numbers)
                 self._motions_changed = True
                 if self._hierarchy:
-                    self._hierarchy.set_off(instance)
+                    self._hierarchy.set_off(numbers, keys)
 
     def set_enabled(self, instance: int, enabled: bool) -> None:
         """Show an instance to rays and queries, or hide it."""

@@ -80,25 +80,28 @@ class InstanceTable:
         arrays = self.poses, self.spheres, self.rows, self.motion, self.rigid
         self.members_changed |= bool(_place(numbers, poses, *arrays))
 
-    def set_off(self, number: int) -> None:
-        """Note that an instance moves; its keys come with `set_motions`."""
+    def set_off(self, numbers: npt.NDArray[np.int64]) -> None:
+        """Note that instances move; their keys come with `set_motions`."""
         self.members_changed = True
-        self.rigid[number] = False
+        self.rigid[numbers] = False
 
     def set_motions(self, motions: Mapping[int, Float64]) -> None:
         """Fill `keys` and `motion` for the instances that move, by id (K, 4, 4), and bound all of their way."""
-        linear = [np.zeros((0, 3, 3))]
-        first = 0
-        for number, keys in motions.items():
-            self.motion[number] = first, len(keys)
-            first += len(keys)
-            linear.append(keys[:, :3, :3])
-            centre, radius = self.spheres[number, :3], self.spheres[number, 3]
-            centres = keys[:, :3, :3] @ centre + keys[:, :3, 3]
-            reach = radius * np.linalg.norm(keys[:, :3, :3], ord=2, axis=(1, 2))
-            self.rows[number, 9:12] = centres[0]
-            self.rows[number, 12] = (reach + np.linalg.norm(centres - centres[0], axis=1)).max()
-        self.keys = np.concatenate(linear).astype(np.float32)
+        if not motions:
+            self.keys = np.zeros((0, 3, 3), np.float32)
+            return
+        numbers = np.fromiter(motions, np.int64, len(motions))
+        counts = np.array([len(keys) for keys in motions.values()])
+        first = np.cumsum(counts) - counts
+        self.motion[numbers, 0], self.motion[numbers, 1] = first, counts
+        keys = np.concatenate(list(motions.values()))
+        linear, owners = keys[:, :3, :3], np.repeat(numbers, counts)
+        centres = (linear @ self.spheres[owners, :3, None])[:, :, 0] + keys[:, :3, 3]
+        reach = self.spheres[owners, 3] * np.linalg.norm(linear, ord=2, axis=(1, 2))
+        way = np.linalg.norm(centres - np.repeat(centres[first], counts, axis=0), axis=1)
+        self.rows[numbers, 9:12] = centres[first]
+        self.rows[numbers, 12] = np.maximum.reduceat(reach + way, first)
+        self.keys = linear.astype(np.float32)
 
 
 def checked_pose(T: npt.ArrayLike, name: str) -> Float64:

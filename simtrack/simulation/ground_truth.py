@@ -14,7 +14,7 @@ from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 from simtrack.simulation.contacts import SUPPORTING, contact_pairs
 from simtrack.simulation.history import History
 from simtrack.simulation.placement import DEEP
-from simtrack.simulation.world import SENSOR_BODIES, World, body_pose
+from simtrack.simulation.world import SENSOR_BODIES, World, body_pose, body_poses
 from simtrack.simulation.world_rays import WorldRays
 
 if TYPE_CHECKING:
@@ -118,19 +118,22 @@ class GroundTruth:
         scratch = self._scratch
         early = max(self._history.start, stamp - self._history.key)
         late = min(self._history.end, stamp + self._history.key)
-        around = []
-        for moment in (early, late):
-            self._history.load(moment, scratch)
-            around.append({name: body_pose(scratch, body) for name, body in self._movable.items()})
+        bodies = list(self._movable.values())
+        self._history.load(early, scratch)
+        before = body_poses(scratch, bodies)
+        self._history.load(late, scratch)
+        after = body_poses(scratch, bodies)
         seconds = max(late - early, 1) / NANOSECONDS
         self._history.load(stamp, scratch)
+        poses = body_poses(scratch, bodies)
+        moved = (after != before).any(axis=(1, 2)).tolist()  # most things rest
         objects = {
             name: ObjectTruth(
-                name, self.class_of(name), self.kind_of(name), body_pose(scratch, body),
-                difference(around[1][name], around[0][name]) / seconds,
+                name, self.class_of(name), self.kind_of(name), poses[k],
+                difference(after[k], before[k]) / seconds if moved[k] else np.zeros(6),
             )
-            for name, body in self._movable.items()
-            if scratch.xpos[body, 2] > -DEEP / 2
+            for k, name in enumerate(self._movable)
+            if poses[k, 2, 3] > -DEEP / 2
         }  # fmt: skip
         contacts, touching = self._contacts.at(stamp)
         base = body_pose(scratch, self._world.bodies["robot"])
@@ -226,8 +229,7 @@ class GroundTruth:
 
     def _object_poses(self) -> tuple[list[str], Float64]:
         names = list(self._world.objects)
-        poses = [body_pose(self._scratch, self._movable[name]) for name in names]
-        return names, np.array(poses).reshape(-1, 4, 4)
+        return names, body_poses(self._scratch, [self._movable[name] for name in names])
 
     def _objects_apart(self, names: list[str], poses: Float64) -> tuple[RayScene, Float64]:
         """A scene in which object k is instance k, displaced by its row of the offsets (K, 3)."""
@@ -241,10 +243,9 @@ class GroundTruth:
                 self._alone.add(meshes[id(mesh)], instance=k)
         offsets = np.zeros((len(names), 3))
         offsets[:, 2] = 200.0 * np.arange(len(names))
-        for k, T in enumerate(poses):
-            shifted = T.copy()
-            shifted[:3, 3] += offsets[k]
-            self._alone.set_pose(k, shifted)
+        shifted = poses.copy()
+        shifted[:, :3, 3] += offsets
+        self._alone.set_poses(range(len(names)), shifted)
         return self._alone, offsets
 
     def _silhouette_rays(

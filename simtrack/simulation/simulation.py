@@ -22,6 +22,7 @@ from simtrack.errors import FileFormatError, InvalidValueError, RenderingError, 
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.geometry.transforms import inverse, rotation_from_rpy, transform, transform_planar
 from simtrack.objects import ObjectModel, TrackerModelConfig, tracker_model
+from simtrack.perception.beside import AtOnce
 from simtrack.raycast import RayBundle
 from simtrack.sensors.camera import XTION, CameraModel
 from simtrack.sensors.faults import CalibrationFaults, FaultyFeed, FeedFaults
@@ -75,6 +76,7 @@ class Simulation:
         scan_key: int = KEY_NS,
         servo: int = TIMESTEP_NS,
         key: int = KEY_NS,
+        threads: bool = True,
     ) -> None:
         """Build the world of `scene` for `seed` and let it settle; stamp 0 is the moment after.
 
@@ -89,18 +91,19 @@ class Simulation:
             memory: nanoseconds of the past that `truth` can be asked about at least; all of it if None.
             proprioception: nanoseconds between odometry readings and between joint states.
             scan_key: nanoseconds between the moments of a lidar's turn that its motion is interpolated from.
-            servo: nanoseconds between the setpoints of robot and hand: a physics step, or two.
+            servo: nanoseconds between the setpoints of robot and hand: physics steps of which some fill a `key`.
             key: nanoseconds between the states that are remembered; those in between are interpolated.
+            threads: lidar and noise have a thread of their own, where that saves time; frames are the same without.
 
         Raises:
             SimtrackError: whatever is wrong with the scene; see `build_world`.
         """
         import mujoco
 
-        if servo not in (TIMESTEP_NS, KEY_NS):
-            raise InvalidValueError("servo", servo, f"{TIMESTEP_NS} or {KEY_NS} ns")
         if key < KEY_NS or key % KEY_NS:
             raise InvalidValueError("key", key, f"a multiple of {KEY_NS} ns")
+        if servo < TIMESTEP_NS or servo % TIMESTEP_NS or key % servo:
+            raise InvalidValueError("servo", servo, f"a multiple of {TIMESTEP_NS} ns that divides the key, {key} ns")
         if unknown := sorted(set(sensors) - set(SENSORS)):
             raise UnknownNameError("sensor", unknown[0], SENSORS)
         self.scene, self.seed = scene, seed
@@ -113,7 +116,7 @@ class Simulation:
         self._data = self.world.data
         self._scratch = mujoco.MjData(self.world.model)
         self._scan_scratch = mujoco.MjData(self.world.model)
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="simtrack-sensors")
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="simtrack-sensors") if threads else AtOnce()
         self._history = History(self.world.model, memory, key)
         self._rays = WorldRays(self.world)
         self.truth = GroundTruth(self.world, self._history, self._rays, intrinsics)
@@ -354,7 +357,7 @@ class Simulation:
         depth = apply_depth_noise(exact, None, self.camera.intrinsics, self.depth_noise, self._rng_depth, draws=draws)
         rgb = self._renderer.rgb(self._scratch) if want_rgb else None
         joints = self._encoders(self._history.qpos(stamp), stamp, self._rng_camera_pose)
-        believed = self.robot.forward(dict(zip(joints.names, joints.positions.tolist(), strict=True)))["camera"]
+        believed = self.robot.pose("camera", dict(zip(joints.names, joints.positions.tolist(), strict=True)))
         sequence = self._counts["camera"] - 1
         return RgbdFrame(stamp, depth, rgb, self.camera.intrinsics, believed, sequence)
 

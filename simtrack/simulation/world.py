@@ -1,6 +1,6 @@
 """From a scene file and a seed to a MuJoCo model: composed through MjSpec, never from XML strings."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -380,3 +380,12 @@ SENSOR_BODIES = {CAMERA: ROBOT + CAMERA, LIDAR: ROBOT + LIDAR}
 def body_pose(data: "mujoco.MjData", body: int) -> Float64:
     """(4, 4) T_map_body, copied."""
     return transform(data.xmat[body].reshape(3, 3), data.xpos[body])
+
+
+def body_poses(data: "mujoco.MjData", bodies: Sequence[int]) -> Float64:
+    """(N, 4, 4) T_map_body of several bodies, copied."""
+    poses = np.zeros((len(bodies), 4, 4))
+    poses[:, :3, :3] = data.xmat[bodies].reshape(-1, 3, 3)
+    poses[:, :3, 3] = data.xpos[bodies]
+    poses[:, 3, 3] = 1.0
+    return poses

@@ -8,7 +8,7 @@ import numpy as np
 from simtrack.contracts import Float32, Float64, Int32
 from simtrack.geometry.meshes import concatenate, transformed
 from simtrack.raycast import RayHits, RayScene, TriangleMesh
-from simtrack.simulation.world import World
+from simtrack.simulation.world import World, body_poses
 
 if TYPE_CHECKING:
     import mujoco
@@ -44,6 +44,8 @@ class WorldRays:
             grey = np.full((len(mesh.faces), 3), 200, np.uint8)
             colors.append(grey if mesh.face_colors is None else mesh.face_colors)
         self._first = 1 if fixed else 0
+        self._bodies = [instance.body for instance in self.moving]
+        self._T_body_mesh = np.array([instance.T_body_mesh for instance in self.moving]).reshape(-1, 4, 4)
         self._face_ids = np.concatenate(ids)
         self._face_colors = np.concatenate(colors)
         self._face_albedos = self._face_colors.mean(axis=1, dtype=np.float32) / np.float32(255)
@@ -65,12 +67,7 @@ class WorldRays:
 
     def poses(self, data: "mujoco.MjData") -> Float64:
         """(I, 4, 4) T_map_mesh of what moves, in the order of `moving`."""
-        out = np.zeros((len(self.moving), 4, 4))
-        bodies = [instance.body for instance in self.moving]
-        out[:, :3, :3] = data.xmat[bodies].reshape(-1, 3, 3)
-        out[:, :3, 3] = data.xpos[bodies]
-        out[:, 3, 3] = 1.0
-        return out @ np.stack([instance.T_body_mesh for instance in self.moving]) if self.moving else out
+        return body_poses(data, self._bodies) @ self._T_body_mesh
 
     def move(self, keys: Sequence[Float64]) -> None:
         """Let everything move through keys (K of (I, 4, 4), see `poses`) during ray time 0 to 1."""
@@ -78,8 +75,7 @@ class WorldRays:
         still = np.abs(tracks - tracks[:, :1]).max(axis=(1, 2, 3)) < STILL
         numbers = np.arange(self._first, self._first + len(tracks))
         self.scene.set_poses(numbers[still].tolist(), tracks[still, 0])
-        for number, track in zip(numbers[~still].tolist(), tracks[~still], strict=True):
-            self.scene.set_motion(number, track)
+        self.scene.set_motions(numbers[~still].tolist(), tracks[~still])
 
     def ids(self, hits: RayHits) -> Int32:
         """(N,) index into `World.names` of what each ray hit, -1 = nothing."""

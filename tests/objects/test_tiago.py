@@ -70,3 +70,11 @@ def test_the_lidar_sees_out_but_the_body_hides_a_sector() -> None:
     assert 0.05 < share < 0.35
     behind = np.abs(azimuth) > 2.0
     assert not np.any(np.array(hidden)[:, behind])
+
+
+def test_the_pose_of_one_link_is_that_among_all() -> None:
+    robot = tiago()
+    positions = {joint.name: 0.5 * (joint.lower + joint.upper) + 0.1 for joint in robot.joints}
+    poses = robot.forward(positions)
+    for link in robot.links:
+        assert np.array_equal(robot.pose(link.name, positions), poses[link.name])

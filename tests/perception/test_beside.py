@@ -86,8 +86,10 @@ def room() -> StaticMap:
     return _room()
 
 
-def _beliefs(room: StaticMap, feed: list[SensorFrame], detector: Asked) -> list[Belief]:
-    stack = PerceptionStack(room, {}, tiago(), detector, T_map_base=START)
+def _beliefs(
+    room: StaticMap, feed: list[SensorFrame], detector: Asked, config: StackConfig | None = None
+) -> list[Belief]:
+    stack = PerceptionStack(room, {}, tiago(), detector, T_map_base=START, config=config)
     try:
         return [belief for frame in feed if (belief := stack.process(frame)) is not None]
     finally:
@@ -112,6 +114,10 @@ def test_beliefs_do_not_depend_on_how_long_anything_takes(room: StaticMap, monke
     monkeypatch.setattr(beside, "_timed", dawdle)
     slow = _beliefs(room, feed, Asked())
     assert [_figures(a) for a in usual] == [_figures(b) for b in slow]
+    names = {thread.name for thread in threading.enumerate()}
+    alone = _beliefs(room, feed, Asked(), StackConfig(threads=False))
+    assert [_figures(a) for a in usual] == [_figures(b) for b in alone]
+    assert {thread.name for thread in threading.enumerate()} <= names
     assert any(belief.lidar is not None for belief in usual)
 
 
@@ -163,6 +169,23 @@ def test_what_the_work_raises_is_raised_where_it_is_settled() -> None:
     piece.begin(1, lambda: None)  # and the next one can begin
     piece.settle()
     thread.shutdown()
+
+
+def test_without_threads_the_caller_does_the_work_and_learns_of_it_when_it_settles() -> None:
+    def fail() -> str:
+        raise ValueError("no data")
+
+    here = worker("test", threads=False)
+    piece = Beside[str](here, 0.05)
+    piece.begin(0, lambda: threading.current_thread().name)
+    assert not piece.due(0) and piece.due(50_000_000)
+    assert piece.settle() == threading.current_thread().name
+    piece.begin(0, fail)
+    with pytest.raises(ValueError, match="no data"):
+        piece.settle()
+    paced = Paced[int](here, 1e-6, lambda step: [step(), step()].count(None))
+    assert paced.end(0, 1_999) is None and paced.end(0, 2_000) == 2_000 and paced.settle() == 2
+    here.shutdown()
 
 
 def test_the_past_cannot_be_waited_for() -> None:

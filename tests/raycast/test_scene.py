@@ -190,6 +190,25 @@ def test_motion_is_the_baked_mesh_at_the_rays_time(use_fallback: bool) -> None:
         assert_same_hits(scene.cast_rays(origins, directions, np.full(800, 0.7)), oracle.cast_rays(origins, directions))
 
 
+@pytest.mark.parametrize("use_fallback", [False, True])
+def test_several_set_off_at_once_as_one_by_one(use_fallback: bool) -> None:
+    way = np.stack([transform(exp_so3(np.array([0, 0, 0.1 * i])), (0.2 * i, 0.1, 0)) for i in range(3)])
+    keys = np.stack([way, transform(translation=(0.0, 1.5, 0.5)) @ way])
+    origins, directions = random_rays(600, seed=4)
+    times = np.random.default_rng(5).uniform(size=600)
+    with RayScene(use_fallback=use_fallback) as together, RayScene(use_fallback=use_fallback) as apart:
+        for scene in (together, apart):
+            scene.add_many([shape(BOX)] * 2, np.stack([np.eye(4)] * 2), [3, 8])
+        together.set_motions([3, 8], keys)
+        for number, track in zip([3, 8], keys, strict=True):
+            apart.set_motion(number, track)
+        assert_same_hits(together.cast_rays(origins, directions, times), apart.cast_rays(origins, directions, times))
+        with pytest.raises(InvalidValueError, match="T_keys"):
+            together.set_motions([3], keys)
+        with pytest.raises(InvalidValueError, match="instance"):
+            together.set_motions([3, 9], keys)
+
+
 def test_the_fallback_gives_the_same_ranges() -> None:
     bundle = RayBundle.from_camera(CAMERA)
     T = look_at(np.array([2.0, 1.0, 1.0]), np.zeros(3))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simtrack.errors import FileFormatError
-from simtrack.simulation.placement import Outline, outline, separation
+from simtrack.simulation.placement import Outline, is_free, outline, separation
 from simtrack.simulation.scene_file import SceneFile, load_scene
 from simtrack.simulation.simulation import Simulation
 from simtrack.simulation.world import body_pose, build_world
@@ -20,6 +20,17 @@ def test_separation_of_rectangles() -> None:
     assert separation(a, Outline(0.0, 0.3, np.pi / 2, (0.1, 0.05), 0.0, 0.1)) == pytest.approx(0.15)
     assert separation(a, Outline(0.1, 0.0, 0.5, (0.1, 0.05), 0.0, 0.1)) < 0
     assert separation(a, Outline(0.1, 0.0, 0.5, (0.1, 0.05), 0.2, 0.3)) == np.inf
+
+
+def test_what_is_far_is_free_as_the_separation_says() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        a, b = (
+            Outline(*rng.uniform(-0.5, 0.5, 2), rng.uniform(-3, 3), tuple(rng.uniform(0.01, 0.2, 2)), 0.0, 0.1)
+            for _ in range(2)
+        )
+        gap = rng.uniform(0.0, 0.3)
+        assert is_free(a, [b], gap) == (separation(a, b) >= gap)
 
 
 @pytest.mark.parametrize("seed", [0, 7])

@@ -13,8 +13,9 @@ import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Detection, Float64, PoseHypothesis
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import angle_between, exp_so3, log_so3, skew, transform
+from simtrack.geometry.transforms import angle_between, exp_so3, transform
 from simtrack.objects import ObjectModel
+from simtrack.perception.detection import pnp_kernels as kernels
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +67,10 @@ def solve_pose(
     if extent < 1.0:
         return []
 
+    camera = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
     found: list[tuple[float, Float64]] = []
-    for T, matched in _candidates(points, pixels, model, intrinsics):
-        error = _rms(T, matched, pixels, intrinsics)
+    for T, squared in _candidates(points, pixels, model, intrinsics, camera):
+        error = float(np.sqrt(squared / len(pixels)))
         depth = T[2, 3]
         if np.isfinite(T).all() and 0.05 < depth < config.max_distance and error <= config.max_error * extent:
             found.append((error, T))
@@ -80,7 +82,7 @@ def solve_pose(
             break
         if any(angle_between(T[:3, :3], h.T_camera_object[:3, :3]) < config.distinct_angle for h in hypotheses):
             continue
-        covariance = _covariance(T, points, sigma, intrinsics) * config.error_correlation
+        covariance = config.error_correlation * np.asarray(kernels.covariance(T, points, sigma, camera), np.float64)
         hypotheses.append(PoseHypothesis(detection.class_name, stamp, T, covariance, error, detection.score))
     return hypotheses
 
@@ -93,13 +95,14 @@ def project_points(T_camera_object: Float64, points: Float64, intrinsics: Camera
 
 
 def _candidates(
-    points: Float64, pixels: Float64, model: ObjectModel, intrinsics: CameraIntrinsics
-) -> Iterator[tuple[Float64, Float64]]:
-    """Poses (4, 4), each with the object points (N, 3) that it takes the pixels for."""
-    T = _pnp(points, pixels, intrinsics)
-    if T is None:
+    points: Float64, pixels: Float64, model: ObjectModel, intrinsics: CameraIntrinsics, camera: Float64
+) -> Iterator[tuple[Float64, float]]:
+    """Poses (4, 4), each with the sum of its squared reprojection errors, pixels^2."""
+    first = _pnp(points, pixels, intrinsics, camera)
+    if first is None:
         return
-    yield T, points
+    yield first
+    T = first[0]
     # Seen from afar, a box tilted towards the camera looks like one tilted away: start again from the reversed tilt.
     view = T[:3, 3] / np.linalg.norm(T[:3, 3])
     for axis in range(3):
@@ -109,26 +112,28 @@ def _candidates(
             angle = 2.0 * np.arctan2(norm, abs(float(normal @ view)))
             sign = 1.0 if normal @ view > 0 else -1.0
             start = transform(exp_so3(sign * angle * tilt / norm) @ T[:3, :3], T[:3, 3])
-            yield _refine(start, points, pixels, intrinsics), points
+            yield kernels.refine(start, points, pixels, camera)
     # A detector confuses the corners of symmetric objects: give each keypoint the nearest equivalent corner.
     for symmetry in model.symmetries.discrete[1:]:
         alternatives = np.stack([points, points @ symmetry[:3, :3].T + symmetry[:3, 3]])
-        T_mixed, mixed = T, points
+        solution = first
         for _ in range(3):
-            projected = np.stack([project_points(T_mixed, p, intrinsics) for p in alternatives])
+            projected = np.stack([project_points(solution[0], p, intrinsics) for p in alternatives])
             distances = np.linalg.norm(projected - pixels, axis=2)
             mixed = alternatives[np.argmin(distances, axis=0), np.arange(len(points))]
             if not np.isfinite(distances).all() or len(np.unique(mixed.round(6), axis=0)) < 6:
                 break  # too few different corners left to be a box
-            solution = _pnp(mixed, pixels, intrinsics)
+            solution = _pnp(mixed, pixels, intrinsics, camera)
             if solution is None:
                 break
-            T_mixed = solution
         else:
-            yield T_mixed, mixed
+            yield solution
 
 
-def _pnp(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> Float64 | None:
+def _pnp(
+    points: Float64, pixels: Float64, intrinsics: CameraIntrinsics, camera: Float64
+) -> tuple[Float64, float] | None:
+    """Pose and squared error from nothing but the correspondences; None where they have no answer."""
     try:
         ok, rotation, translation = cv2.solvePnP(
             points, pixels, intrinsics.matrix, np.zeros(5), flags=cv2.SOLVEPNP_SQPNP
@@ -137,35 +142,5 @@ def _pnp(points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> Floa
         return None
     if not ok or not np.isfinite(rotation).all() or not np.isfinite(translation).all():
         return None
-    return _refine(_transform(rotation, translation), points, pixels, intrinsics)
-
-
-def _refine(T: Float64, points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> Float64:
-    try:
-        rotation, translation = cv2.solvePnPRefineLM(
-            points, pixels, intrinsics.matrix, np.zeros(5), log_so3(T[:3, :3]).reshape(3, 1), T[:3, 3:].copy()
-        )
-    except cv2.error:
-        return T
-    return _transform(rotation, translation)
-
-
-def _transform(rotation: np.ndarray, translation: np.ndarray) -> Float64:
-    return transform(exp_so3(rotation.astype(np.float64).ravel()), translation.astype(np.float64).ravel())
-
-
-def _rms(T: Float64, points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> float:
-    error = np.linalg.norm(project_points(T, points, intrinsics) - pixels, axis=1)
-    return float(np.sqrt(np.mean(error**2))) if np.isfinite(error).all() else np.inf
-
-
-def _covariance(T: Float64, points: Float64, sigma: Float64, intrinsics: CameraIntrinsics) -> Float64:
-    """(6, 6) inverse Fisher information of the keypoints, camera frame."""
-    information = np.zeros((6, 6))
-    offsets = points @ T[:3, :3].T
-    for p, offset, s in zip(offsets + T[:3, 3], offsets, sigma, strict=True):
-        x, y, z = p
-        projection = np.array([[intrinsics.fx, 0, -intrinsics.fx * x / z], [0, intrinsics.fy, -intrinsics.fy * y / z]])
-        J = projection / z @ np.hstack([np.eye(3), -skew(offset)])
-        information += J.T @ J / s**2
-    return np.asarray(np.linalg.inv(information + 1e-3 * np.eye(6)), dtype=np.float64)
+    start = transform(exp_so3(rotation.astype(np.float64).ravel()), translation.astype(np.float64).ravel())
+    return kernels.refine(start, points, pixels, camera)

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 
 from simtrack.contracts import (
@@ -17,6 +17,7 @@ from simtrack.contracts import (
 )
 from simtrack.errors import InvalidValueError
 from simtrack.objects import ObjectModel
+from simtrack.perception.beside import worker
 from simtrack.perception.detection.pnp import PnpConfig, solve_pose
 
 
@@ -42,13 +43,19 @@ class DetectorRunner:
     """
 
     def __init__(
-        self, detector: Detector, models: Mapping[str, ObjectModel], config: RunnerConfig | None = None
+        self,
+        detector: Detector,
+        models: Mapping[str, ObjectModel],
+        config: RunnerConfig | None = None,
+        threads: bool = True,
     ) -> None:
+        """Without `threads` the caller's does all work, and nothing protects it from a detector that hangs."""
         self.config = config or RunnerConfig()
+        self._threads = threads
         self._detector, self._models = detector, dict(models)
         self._free_at: int | None = None
         self._waiting: list[tuple[DetectionResult, Future[list[PoseHypothesis]]]] = []
-        self._solver: ThreadPoolExecutor | None = None
+        self._solver: Executor | None = None
         self._hanging: threading.Thread | None = None
         self.status = Status.OK
 
@@ -69,7 +76,7 @@ class DetectorRunner:
             return None
         self.status, self._free_at = result.status, max(result.available, frame.stamp + 1)
         if self._solver is None:
-            self._solver = ThreadPoolExecutor(1, "simtrack-pnp")
+            self._solver = worker("pnp", threads=self._threads)
         # Until the answer is due there is time to solve for the poses.
         self._waiting.append((result, self._solver.submit(self._hypotheses, result, frame.intrinsics)))
         return result
@@ -106,8 +113,11 @@ class DetectorRunner:
             except Exception:  # whatever a foreign detector raises is its failure, not the pipeline's
                 answer.clear()
 
-        self._hanging = threading.Thread(target=work, name="simtrack-detector", daemon=True)
-        self._hanging.start()
-        self._hanging.join(self.config.timeout)
+        if self._threads:
+            self._hanging = threading.Thread(target=work, name="simtrack-detector", daemon=True)
+            self._hanging.start()
+            self._hanging.join(self.config.timeout)
+        else:
+            work()
         good = answer and isinstance(answer[0], DetectionResult) and answer[0].stamp == frame.stamp
         return answer[0] if good else None

@@ -66,7 +66,7 @@ class ClaimQueue:
         """How often the thread has followed the first claim's candidate since."""
         self._free = 0
         """Stamp at which the thread is taken to have ended the claim that was settled last, nanoseconds."""
-        self._thread = worker("claims", config.wait)
+        self._thread = worker("claims", config.wait, config.threads)
 
     def add(self, claim: Claim) -> None:
         """Queue a claim. It takes the turn of an older one about the same thing, or is dropped if that is at work."""

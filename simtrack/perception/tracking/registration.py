@@ -139,7 +139,8 @@ class Registration:
         predicted = batch.poses.copy()
         self._marks[:] = 0
         self._follow(batch, (config.near,), np.ones(len(batch.instances), bool))
-        far = ~batch.near(predicted, config)
+        # What no ray met is hidden: nothing tells where it is.
+        far = ~batch.near(predicted, config) & (batch.counts[:, kernels.SUPPORTED :].sum(axis=1) > 0)
         if far.any():
             batch.poses[far] = predicted[far]
             self._follow(batch, config.track_schedule, far)
@@ -342,13 +343,14 @@ class _Batch:
         """Move the active instances by solver steps on fixed correspondences (0: only judge the present poses)."""
         count = len(self.instances)
         centres, shifts = self.poses[:, :3, 3].copy(), np.zeros((count, 3))
-        rotations = np.tile(np.eye(3), (count, 1, 1))
+        rotations = np.zeros((count, 3, 3))
+        rotations[:, [0, 1, 2], [0, 1, 2]] = 1.0
         self.used[self.active] = strides[self.active]
         steps = iterations
         if config.solver == "umeyama":
             solver.umeyama(points, pairs, centres, rotations, shifts, iterations)
             steps = 0
-        shares = np.array([[config.correlation_area / s**2, config.edge_correlation / s] for s in strides])
+        shares = np.column_stack([config.correlation_area / strides**2, config.edge_correlation / strides])
         settings = solver.SolverSettings(
             step.kernel, config.edge_kernel, _EDGES[step.silhouettes], config.edge_sigma, config.unconstrained_sigma,
             config.max_shift, config.max_turn, config.last_step,

@@ -28,6 +28,8 @@ class TrackerConfig:
     that this needs is taken to last so long, seconds of the sensor's clock."""
     wait: bool = True
     """Frames wait for such a registration when its time is up; False: see `simtrack.perception.beside`."""
+    threads: bool = True
+    """Such a registration has a thread of its own; False: see there."""
     confirm_detections: int = 2
     """Detections that a new object needs before it is believed; one is enough where the fit leaves no doubt."""
     confirm_frames: int = 3

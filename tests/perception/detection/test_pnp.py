@@ -5,11 +5,13 @@ from hypothesis import strategies as st
 
 from simtrack.contracts import CameraIntrinsics, Detection
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import angle_between, exp_so3, transform
+from simtrack.geometry.transforms import angle_between, exp_so3, perturb, transform
 from simtrack.objects import load_object
+from simtrack.perception.detection import pnp_kernels as kernels
 from simtrack.perception.detection.pnp import PnpConfig, project_points, solve_pose
 
 K = CameraIntrinsics(640, 480, 577.0, 577.0, 319.5, 239.5)
+CAMERA = np.array([K.fx, K.fy, K.cx, K.cy])
 MODEL = load_object("powerdrill")
 
 
@@ -32,6 +34,43 @@ def test_exact_keypoints_give_the_exact_pose(phi: tuple, position: tuple) -> Non
     assert np.linalg.norm(best.T_camera_object[:3, 3] - T[:3, 3]) < 1e-4
     assert angle_between(best.T_camera_object[:3, :3], T[:3, :3]) < 1e-3
     assert best.reprojection_error < 1e-2
+
+
+def _reprojection(T: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    return (project_points(T, MODEL.keypoints, K) - pixels).ravel()
+
+
+def test_the_information_is_that_of_finite_differences() -> None:
+    rng = np.random.default_rng(1)
+    T = transform(exp_so3(np.array([1.0, -0.3, 0.4])), (0.1, -0.05, 1.1))
+    pixels = project_points(T, MODEL.keypoints, K) + rng.standard_normal((9, 2))
+    H, g = np.empty((6, 6)), np.empty(6)
+    kernels.normal_equations(T, MODEL.keypoints, pixels, np.ones(9), CAMERA, H, g)
+    step = 1e-6
+    columns = [_reprojection(perturb(T, step * xi), pixels) - _reprojection(T, pixels) for xi in np.eye(6)]
+    J = np.stack(columns, axis=1) / step
+    np.testing.assert_allclose(H, J.T @ J, rtol=1e-3, atol=1e-2 * np.abs(H).max() / 100)
+    np.testing.assert_allclose(g, J.T @ _reprojection(T, pixels), rtol=1e-3, atol=1e-4 * np.abs(g).max())
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 1000))
+def test_refinement_ends_where_nothing_near_is_better(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    T = transform(exp_so3(rng.uniform(-2.0, 2.0, 3)), (*rng.uniform(-0.2, 0.2, 2), rng.uniform(0.6, 2.0)))
+    pixels = project_points(T, MODEL.keypoints, K) + 3.0 * rng.standard_normal((9, 2))
+    start = perturb(T, np.concatenate([rng.uniform(-0.05, 0.05, 3), rng.uniform(-0.3, 0.3, 3)]))
+    found, error = kernels.refine(start, MODEL.keypoints, pixels, CAMERA)
+    assert error <= kernels.squared_error(start, MODEL.keypoints, pixels, CAMERA)
+    assert error == pytest.approx(float(_reprojection(found, pixels) @ _reprojection(found, pixels)), rel=1e-6)
+    around = [perturb(found, s * 1e-4 * xi) for xi in np.eye(6) for s in (1.0, -1.0)]
+    assert all(kernels.squared_error(near, MODEL.keypoints, pixels, CAMERA) >= error * (1.0 - 1e-6) for near in around)
+
+
+def test_a_pose_behind_the_camera_is_given_back() -> None:
+    behind = transform(translation=(0.0, 0.0, -1.0))
+    found, error = kernels.refine(behind, MODEL.keypoints, np.zeros((9, 2)), CAMERA)
+    assert error == np.inf and np.array_equal(found, behind)
 
 
 def test_covariance_is_that_of_the_noise() -> None:
