@@ -14,6 +14,7 @@ from simtrack.objects import ObjectModel
 from simtrack.perception.detection.boxes import Box, overlap
 from simtrack.perception.detection.keypoint_detector import KeypointDetector
 from simtrack.perception.detection.pnp import project_points, solve_pose
+from simtrack.perception.detection.pose_search import PoseSearch
 from simtrack.perception.tracking.birth import FitConfig, Prober
 from simtrack.perception.tracking.registration import RegistrationConfig
 from simtrack.perception.tracking.target import tracked_model
@@ -183,10 +184,12 @@ class _PoseSteps:
             name: PoseScorer(np.asarray(model.mesh.vertices, float), model.symmetries, model.diameter)
             for name, model in models.items()
         }
+        self._search = PoseSearch(models)
         self._prober = Prober(RegistrationConfig(), FitConfig())
 
     def close(self) -> None:
-        """Release the scene of rays."""
+        """Release the scenes of rays."""
+        self._search.close()
         self._prober.close()
 
     def errors(
@@ -198,13 +201,13 @@ class _PoseSteps:
         if detection is None:
             return out
         hypotheses = solve_pose(detection, model, frame.intrinsics, frame.stamp)
+        if hypotheses:
+            out["pnp"] = self._compared(model.name, hypotheses[0].T_camera_object, T_true)
+        hypotheses = self._search.search(detection, frame.depth, frame.intrinsics, frame.stamp, hypotheses)
         if not hypotheses:
             return out
-        first, tracked = hypotheses[0], self._tracked[model.name]
-        out["pnp"] = self._compared(model.name, first.T_camera_object, T_true)
-        aligned = self._prober.aligned(first, tracked, frame.depth, frame.intrinsics, {})
-        out["depth"] = self._compared(model.name, aligned[0], T_true)
-        found = self._prober.best(hypotheses, tracked, frame.depth, frame.intrinsics, {})
+        out["depth"] = self._compared(model.name, hypotheses[0].T_camera_object, T_true)
+        found = self._prober.best(hypotheses, self._tracked[model.name], frame.depth, frame.intrinsics, {})
         if found is not None:
             out["registered"] = self._compared(model.name, found.T_camera_object, T_true)
         return out

@@ -68,7 +68,7 @@ def solve_pose(
 
     found: list[tuple[float, Float64]] = []
     for T, matched in _candidates(points, pixels, model, intrinsics):
-        error = _rms(T, matched, pixels, intrinsics)
+        error = reprojection_error(T, matched, pixels, intrinsics)
         depth = T[2, 3]
         if np.isfinite(T).all() and 0.05 < depth < config.max_distance and error <= config.max_error * extent:
             found.append((error, T))
@@ -80,7 +80,7 @@ def solve_pose(
             break
         if any(angle_between(T[:3, :3], h.T_camera_object[:3, :3]) < config.distinct_angle for h in hypotheses):
             continue
-        covariance = _covariance(T, points, sigma, intrinsics) * config.error_correlation
+        covariance = keypoint_covariance(T, points, sigma, intrinsics) * config.error_correlation
         hypotheses.append(PoseHypothesis(detection.class_name, stamp, T, covariance, error, detection.score))
     return hypotheses
 
@@ -154,12 +154,13 @@ def _transform(rotation: np.ndarray, translation: np.ndarray) -> Float64:
     return transform(exp_so3(rotation.astype(np.float64).ravel()), translation.astype(np.float64).ravel())
 
 
-def _rms(T: Float64, points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> float:
+def reprojection_error(T: Float64, points: Float64, pixels: Float64, intrinsics: CameraIntrinsics) -> float:
+    """RMS distance of projected (N, 3) object points from (N, 2) pixels; inf if one lies behind the camera."""
     error = np.linalg.norm(project_points(T, points, intrinsics) - pixels, axis=1)
     return float(np.sqrt(np.mean(error**2))) if np.isfinite(error).all() else np.inf
 
 
-def _covariance(T: Float64, points: Float64, sigma: Float64, intrinsics: CameraIntrinsics) -> Float64:
+def keypoint_covariance(T: Float64, points: Float64, sigma: Float64, intrinsics: CameraIntrinsics) -> Float64:
     """(6, 6) inverse Fisher information of the keypoints, camera frame."""
     information = np.zeros((6, 6))
     offsets = points @ T[:3, :3].T
