@@ -30,13 +30,13 @@ class PoseSearchConfig:
 
     orientations: int = 1800
     """Of the grid: about 20 degrees from one to the next."""
-    cast: int = 64
+    cast: int = 128
     """So many of them are cast."""
     rays: int = 14
     """A side of the grid of rays in a box, for these ..."""
     fine_rays: int = 20
     """... and for those that are refined."""
-    refined: int = 8
+    refined: int = 10
     """So many of them."""
     kept: int = 3
     """Hypotheses at most."""
@@ -52,11 +52,11 @@ class PoseSearchConfig:
     """Of agreeing depths, metres, beside the sensor's noise."""
     front: float = 0.4
     """How much a reading in front of the model counts against it; one behind it counts 1."""
-    depth_weight: float = 30.0
+    depth_weight: float = 80.0
     """Of the share of agreeing rays, beside the costs of keypoints and box."""
     border_step: float = 0.02
     """Least depth step at a silhouette, metres."""
-    border_weight: float = 6.0
+    border_weight: float = 16.0
     """Of the share of the silhouette with a depth step."""
     max_shift: float = 0.02
     """Longest step of the refinement, metres ..."""
@@ -94,6 +94,8 @@ class ShownModel:
     """(P, 3), points whose projections have the silhouette's box."""
     radius: float
     """Metres."""
+    alike: Float64
+    """(S, 3, 3), rotations of its symmetries."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

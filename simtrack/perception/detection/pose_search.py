@@ -18,7 +18,6 @@ from simtrack.perception.detection import search_kernels as kernels
 from simtrack.perception.detection.evidence import Evidence, PoseSearchConfig, RayGrid, ShownModel, rotation_grid
 from simtrack.perception.detection.pnp import PnpConfig, keypoint_covariance, reprojection_error
 from simtrack.perception.tracking import correspondences, solver
-from simtrack.perception.tracking.association import rotation_apart
 from simtrack.perception.tracking.registration_config import RegistrationConfig
 from simtrack.raycast import RayScene, TriangleMesh
 
@@ -82,7 +81,8 @@ class PoseSearch:
             directions = rotation_grid(60)[:, 0]
             extreme = np.unique(np.argmax(points @ directions.T, axis=0))
             radius = 0.5 * float(np.linalg.norm(model.extents))
-            self._shown[name] = ShownModel(model, scene, points[extreme], radius)
+            alike = model.symmetries.poses(0.5 * self.config.distinct)[:, :3, :3]
+            self._shown[name] = ShownModel(model, scene, points[extreme], radius, alike)
         return self._shown[name]
 
     def _likeliest(self, e: "Evidence", starts: Sequence[PoseHypothesis]) -> tuple[Float64, Float64, Float64]:
@@ -113,13 +113,15 @@ class PoseSearch:
 
     def _distinct(self, poses: Float64, costs: Float64, shown: ShownModel, count: int) -> Float64:
         """(H, 4, 4): the best `count` of the poses (N, 4, 4) that are not turned alike, the best first."""
-        kept: list[Float64] = []
-        for k in np.argsort(costs, kind="stable"):
-            if all(rotation_apart(poses[k], other, shown.model) >= self.config.distinct for other in kept):
-                kept.append(poses[k])
-            if len(kept) == count:
-                break
-        return np.array(kept)
+        rotations, order = poses[:, :3, :3].reshape(-1, 9), np.argsort(costs, kind="stable")
+        kept: list[int] = []
+        while len(order) and len(kept) < count:
+            kept.append(int(order[0]))
+            alike = (poses[order[0], :3, :3] @ shown.alike).reshape(-1, 9)
+            # The trace of a rotation from one pose to another tells its angle.
+            nearest = (rotations[order] @ alike.T).max(axis=1)
+            order = order[nearest < 1.0 + 2.0 * np.cos(self.config.distinct)]
+        return poses[kept]
 
     def _refine(self, e: Evidence, shown: ShownModel, poses: Float64) -> None:
         """Move poses (H, 4, 4) by the registration's solver on coarse rays, in place."""
