@@ -28,15 +28,15 @@ DISTANCE_SIGMA = 0.15
 class PoseSearchConfig:
     """Settings of `PoseSearch`."""
 
-    orientations: int = 1800
-    """Of the grid: about 20 degrees from one to the next."""
-    cast: int = 128
+    orientations: int = 1200
+    """Of the grid: about 25 degrees from one to the next."""
+    cast: int = 112
     """So many of them are cast."""
-    rays: int = 14
+    rays: int = 9
     """A side of the grid of rays in a box, for these ..."""
-    fine_rays: int = 20
+    fine_rays: int = 16
     """... and for those that are refined."""
-    refined: int = 10
+    refined: int = 9
     """So many of them."""
     kept: int = 3
     """Hypotheses at most."""
