@@ -69,8 +69,9 @@ class PoseSearchConfig:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            if not getattr(self, field.name) >= 0.0:
-                raise InvalidValueError(f"PoseSearchConfig.{field.name}", getattr(self, field.name), ">= 0")
+            value, whole = getattr(self, field.name), field.type in (int, "int")
+            if not value >= (1 if whole else 0):
+                raise InvalidValueError(f"PoseSearchConfig.{field.name}", value, ">= 1" if whole else ">= 0")
 
 
 def rotation_grid(count: int) -> Float64:

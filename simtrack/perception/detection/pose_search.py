@@ -61,7 +61,7 @@ class PoseSearch:
         Returns:
             Empty where there is no depth in the box.
         """
-        shown = self._show(detection.class_name)
+        shown = self.shown(detection.class_name)
         evidence = Evidence.of(detection, shown, depth, intrinsics, self.config)
         if evidence is None:
             return []
@@ -73,7 +73,8 @@ class PoseSearch:
         best = self._distinct(poses, self._judge(evidence, shown, poses), shown, self.config.kept)
         return [_hypothesis(evidence, T, detection, stamp) for T in best]
 
-    def _show(self, name: str) -> ShownModel:
+    def shown(self, name: str) -> ShownModel:
+        """A model as it is tried, made ready at first use."""
         if name not in self._shown:
             model, scene = self._models[name], RayScene()
             scene.add(TriangleMesh(model.mesh.vertices, model.mesh.faces))

@@ -235,18 +235,6 @@ class Prober:
         theirs = self._registration.explained(depth, intrinsics, PROBE, T_camera_other)
         return float(np.count_nonzero(mine & theirs)) / max(int(np.count_nonzero(mine)), 1)
 
-    def aligned(
-        self,
-        hypothesis: PoseHypothesis,
-        model: TrackedModel,
-        depth: Float32,
-        intrinsics: CameraIntrinsics,
-        occluders: Occluders,
-    ) -> list[Float64]:
-        """(4, 4) poses: a hypothesis slid along its viewing ray to where depth was measured, the likeliest first."""
-        self._show(model, occluders)
-        return self._aligned(hypothesis.T_camera_object, depth, intrinsics)
-
     def _show(self, model: TrackedModel, occluders: Occluders) -> None:
         """Put a candidate and what stands around it into the scene, and nothing else."""
         wanted = {PROBE: model, **{i: other for i, (other, _) in occluders.items()}}
