@@ -251,7 +251,7 @@ class _PoseSteps:
         hypotheses = solve_pose(detection, model, frame.intrinsics, frame.stamp)
         if hypotheses:
             out["pnp"] = hypotheses[0].T_camera_object
-        hypotheses = self._search.search(detection, frame.depth, frame.intrinsics, frame.stamp, hypotheses)
+        hypotheses = self._search.search(detection, frame.depth, frame.intrinsics, frame.stamp, hypotheses) or []
         if not hypotheses:
             return out
         out["depth"] = hypotheses[0].T_camera_object

@@ -39,7 +39,9 @@ class PoseSearchConfig:
     refined: int = 9
     """So many of them."""
     kept: int = 3
-    """Hypotheses at most."""
+    """Hypotheses at most ..."""
+    least_support: float = 0.7
+    """... and the least share of their rays, but for occluded ones, that must agree with the measured depth."""
     margin: float = 0.1
     """By which the rays' window is larger than the box, in shares of its sides."""
     box_sigma: float = 0.06

@@ -48,7 +48,7 @@ class PoseSearch:
         intrinsics: CameraIntrinsics,
         stamp: int,
         starts: Sequence[PoseHypothesis] = (),
-    ) -> list[PoseHypothesis]:
+    ) -> list[PoseHypothesis] | None:
         """Poses of a detected object, the likeliest first.
 
         Args:
@@ -59,18 +59,21 @@ class PoseSearch:
             starts: further poses to be looked at, as PnP's.
 
         Returns:
-            Empty where there is no depth in the box.
+            Empty where no pose agrees with the measured depth: the detection is wrong. None where nothing can be said:
+            there is no depth in the box, or the box is only that of the keypoints.
         """
         shown = self.shown(detection.class_name)
         evidence = Evidence.of(detection, shown, depth, intrinsics, self.config)
         if evidence is None:
-            return []
+            return None
         rotations, shifts, costs = self._likeliest(evidence, starts)
         scores = self._slide(evidence, shown, rotations, shifts)
         placed = np.array([transform(R, t) for R, t in zip(rotations, shifts, strict=True)])
         poses = self._distinct(placed, costs - self.config.depth_weight * scores, shown, self.config.refined)
         self._refine(evidence, shown, poses)
-        best = self._distinct(poses, self._judge(evidence, shown, poses), shown, self.config.kept)
+        costs, supports = self._judge(evidence, shown, poses)
+        seen = supports >= self.config.least_support
+        best = self._distinct(poses[seen], costs[seen], shown, self.config.kept)
         return [_hypothesis(evidence, T, detection, stamp) for T in best]
 
     def shown(self, name: str) -> ShownModel:
@@ -145,18 +148,19 @@ class PoseSearch:
             )  # fmt: skip
             solver.advance(poses, rotations, shifts, radii, covariance, active, moved, deviations)
 
-    def _judge(self, e: Evidence, shown: ShownModel, poses: Float64) -> Float64:
-        """(H,) costs of poses (H, 4, 4): lower where keypoints, box, depth and silhouette agree."""
+    def _judge(self, e: Evidence, shown: ShownModel, poses: Float64) -> tuple[Float64, Float64]:
+        """Costs (H,) of poses (H, 4, 4), lower where keypoints, box, depth and silhouette agree, and their supports."""
         config, grid = self.config, e.grid(self.config.fine_rays)
         points = correspondences.Points.room(len(poses) * len(grid.pixels))
         _, counts, distances = self._paired(e, grid, shown, poses, config.tolerance, points)
         border = np.zeros((len(poses), 2), np.int64)
         kernels.borders(distances, e.depth[grid.pixels], grid.columns, config.border_step, border)
-        agree = counts[:, correspondences.SUPPORTED] - counts[:, correspondences.MISSING]
-        agree = (agree - config.front * counts[:, correspondences.OCCLUDED]) / len(grid.pixels)
+        supported, missing = counts[:, correspondences.SUPPORTED], counts[:, correspondences.MISSING]
+        agree = (supported - missing - config.front * counts[:, correspondences.OCCLUDED]) / len(grid.pixels)
         silhouette = border[:, 0] / np.maximum(border.sum(axis=1), 1)
         expected = np.array([e.cost(T[:3, :3], T[:3, 3]) for T in poses])
-        return expected - config.depth_weight * agree - config.border_weight * silhouette
+        costs = expected - config.depth_weight * agree - config.border_weight * silhouette
+        return costs, supported / np.maximum(supported + missing, 1)
 
     def _paired(
         self,

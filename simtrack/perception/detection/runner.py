@@ -103,7 +103,8 @@ class DetectorRunner:
             model = self._models.get(detection.class_name)
             if model is not None and detection.keypoints.shape == (9, 2):
                 solved = solve_pose(detection, model, intrinsics, result.stamp, self.config.pnp)
-                hypotheses += self._search.search(detection, depth, intrinsics, result.stamp, solved) or solved
+                found = self._search.search(detection, depth, intrinsics, result.stamp, solved)
+                hypotheses += solved if found is None else found
         return hypotheses
 
     def _call(self, frame: RgbdFrame, regions: Sequence[RegionOfInterest]) -> DetectionResult | None:

@@ -46,10 +46,10 @@ class FitConfig:
     """... and so is one with a larger misfit than this."""
     misfit: float = 1.25
     """A fit with a larger misfit than this is not believed."""
-    near_support: float = 0.5
-    """A hypothesis with more support than this is registered as it is ..."""
+    near_support: float = 0.8
+    """Hypotheses with more support than this are registered as they are, and no others are ..."""
     near_margin: float = 0.8
-    """... and one of the further ones is taken if it fits so much better."""
+    """... of which a further one is taken if it fits so much better."""
     modes: int = 3
     """Up to so many frequent depth differences are tried: the most frequent one may be that of an occluder."""
     survivors: int = 4
@@ -128,8 +128,8 @@ class Prober:
         """Register each alternative and return the one that fits best, or None if none can be believed."""
         self._show(model, occluders)
         near = self._near(hypotheses, depth, intrinsics)
-        if near is not None:
-            return near
+        if near:
+            return self._settled(near, depth, intrinsics)
         starts = [T for h in hypotheses for T in self._aligned(h.T_camera_object, depth, intrinsics)]
         result = self._best_of(starts, depth, intrinsics)
         if result is not None and self._fit.promising < result.support and not self._good(result):
@@ -142,20 +142,30 @@ class Prober:
 
     def _near(
         self, hypotheses: Sequence[PoseHypothesis], depth: Float32, intrinsics: CameraIntrinsics
+    ) -> list[Float64]:
+        """Poses of the hypotheses that agree with the depth image as they are."""
+        judged = [
+            self._registration.assess(depth, intrinsics, {PROBE: h.T_camera_object}, self._fixed).get(PROBE)
+            for h in hypotheses
+        ]
+        return [r.T_camera_object for r in judged if r is not None and r.support >= self._fit.near_support]
+
+    def _settled(
+        self, poses: Sequence[Float64], depth: Float32, intrinsics: CameraIntrinsics
     ) -> RegistrationResult | None:
-        """The best fit of hypotheses that agree with the depth image as they are, if it leaves no doubt.
+        """The best fit from poses that are nearly right, if it can be believed.
 
         Of fits that are about as good the earlier one is taken: the detection knows more than the depth image.
         """
         found: RegistrationResult | None = None
-        for h in hypotheses:
-            judged = self._registration.assess(depth, intrinsics, {PROBE: h.T_camera_object}, self._fixed).get(PROBE)
-            if judged is None or judged.support < self._fit.near_support:
-                continue
-            result = self._register(h.T_camera_object, depth, intrinsics, self._refine)
+        for T in poses:
+            result = self._register(T, depth, intrinsics, self._refine)
             if result is not None and (found is None or cost(result) < self._fit.near_margin * cost(found)):
                 found = result
-        return found if found is not None and self._good(found) and believable(found, self._fit) else None
+        if found is None or not self._good(found):
+            wider = self._best_of(poses, depth, intrinsics)
+            found = min((r for r in (found, wider) if r is not None), key=cost, default=None)
+        return found if found is not None and believable(found, self._fit) else None
 
     def _good(self, result: RegistrationResult) -> bool:
         return result.support >= self._fit.good_support and result.misfit <= self._fit.good_misfit

@@ -63,9 +63,7 @@ def test_the_grid_of_orientations_leaves_no_gap() -> None:
 
 
 @pytest.mark.parametrize("name", PLACES)
-def test_a_true_orientation_is_put_in_its_place(
-    name: str, depth: Float32, search: PoseSearch
-) -> None:
+def test_a_true_orientation_is_put_in_its_place(name: str, depth: Float32, search: PoseSearch) -> None:
     T, shown = in_camera(PLACES[name][1]), search.shown(name)
     e = Evidence.of(detected(name), shown, depth, INTRINSICS, PoseSearchConfig())
     assert e is not None
@@ -133,7 +131,7 @@ def test_keypoints_that_are_too_poor_for_pnp_do_with_depth(name: str, depth: Flo
     for _ in range(6):
         detection = detected(name, rng.normal(0.0, sigma, (9, 2)), sigma)
         solved = solve_pose(detection, PLACES[name][0], INTRINSICS, 5)
-        found = search.search(detection, depth, INTRINSICS, 5, solved)
+        found = search.search(detection, depth, INTRINSICS, 5, solved) or []
         assert {(h.class_name, h.stamp, h.score) for h in found} == {(name, 5, 0.9)}
         metres, degrees = errors(found[0].T_camera_object, name)
         good += metres < 0.01 and degrees < 8.0
@@ -148,13 +146,15 @@ def test_few_keypoints_are_enough(depth: Float32, search: PoseSearch) -> None:
     detection = detected("powerdrill")
     detection.keypoints[3:] = np.nan
     assert solve_pose(detection, DRILL, INTRINSICS, 0) == []
-    metres, degrees = errors(search.search(detection, depth, INTRINSICS, 0)[0].T_camera_object, "powerdrill")
+    found = search.search(detection, depth, INTRINSICS, 0)
+    assert found
+    metres, degrees = errors(found[0].T_camera_object, "powerdrill")
     assert metres < 0.01
     assert degrees < 8.0
 
 
 def test_hypotheses_differ_and_are_no_more_than_asked_for(depth: Float32, search: PoseSearch) -> None:
-    found = search.search(detected("klt3147", sigma=40.0), depth, INTRINSICS, 0)
+    found = search.search(detected("klt3147", sigma=40.0), depth, INTRINSICS, 0) or []
     assert 2 <= len(found) <= search.config.kept
     for k, h in enumerate(found):
         for other in found[:k]:
@@ -163,20 +163,29 @@ def test_hypotheses_differ_and_are_no_more_than_asked_for(depth: Float32, search
 
 def test_a_search_repeats(depth: Float32, search: PoseSearch) -> None:
     detection = detected("powerdrill", np.random.default_rng(4).normal(0.0, 4.0, (9, 2)), 4.0)
-    first, second = (search.search(detection, depth, INTRINSICS, 0) for _ in range(2))
+    first, second = (search.search(detection, depth, INTRINSICS, 0) or [] for _ in range(2))
+    assert first
     assert [h.T_camera_object.tobytes() for h in first] == [h.T_camera_object.tobytes() for h in second]
 
 
 def test_without_depth_or_a_box_of_its_own_there_is_no_search(depth: Float32, search: PoseSearch) -> None:
     detection = detected("powerdrill")
-    assert search.search(detection, np.zeros_like(depth), INTRINSICS, 0) == []
+    assert search.search(detection, np.zeros_like(depth), INTRINSICS, 0) is None
     k = detection.keypoints
     for box in (
         np.concatenate([k.min(axis=0), k.max(axis=0)]),
         np.full(4, np.nan),
         np.array([-90.0, -90.0, -50.0, -60.0]),
     ):
-        assert search.search(Detection("powerdrill", k, np.ones(9), box, 0.9), depth, INTRINSICS, 0) == []
+        assert search.search(Detection("powerdrill", k, np.ones(9), box, 0.9), depth, INTRINSICS, 0) is None
+
+
+def test_a_thing_that_is_not_there_has_no_pose(depth: Float32, search: PoseSearch) -> None:
+    """A drill is claimed to float a decimetre before the bench, where the camera sees through it."""
+    true, closer = detected("powerdrill"), depth.copy()
+    assert search.search(true, closer, INTRINSICS, 0)
+    closer[closer < in_camera(PLACES["powerdrill"][1])[2, 3] + 0.2] += 2.0
+    assert search.search(true, closer, INTRINSICS, 0) == []
 
 
 def test_settings_are_checked() -> None:
