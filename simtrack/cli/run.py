@@ -21,6 +21,7 @@ def run(
     detector: str = "oracle",
     scene_graph: str | None = None,
     stage_limit: float = 5.0,
+    given: str = "",
     renderer: Literal["mujoco", "embree"] = "mujoco",
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     compare_gaze: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
@@ -36,7 +37,7 @@ def run(
         duration: Simulated seconds; the scene's own (30 for the workbench) if not given.
         seed: Of everything random.
         out: Folder for the results; runs/SCENE-SEED if not given.
-        agent: What decides where the robot looks and drives: explorer, fixed-gaze, route; the scene's own if not given.
+        agent: Decides where the robot looks and drives: explorer, fixed-gaze, patrol, route; by default the scene's.
         tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
         localizer: A localizer of yours, package.module:Class, or oracle: one that knows the truth.
         detector: What detects objects in images: oracle (knows the truth, and errs like a trained network), keypoints
@@ -44,6 +45,7 @@ def run(
             package.module:Class.
         scene_graph: What says how things stand to each other, of yours, package.module:Class.
         stage_limit: Seconds that a stage of yours has for a frame; after that the frame counts as missed.
+        given: Conditions: noise=2,occlusion=3 (see docs/instrument.md).
         renderer: mujoco needs OpenGL (EGL), embree needs none.
         overwrite: Replace the results in an existing folder.
         compare_gaze: Run the fixed gaze on the same seed, too: what does the agent's gaze gain?
@@ -60,14 +62,20 @@ def run(
     from simtrack.evaluation.rehearsal import rehearse
     from simtrack.evaluation.run_config import RunConfig
     from simtrack.report.page import write_report
+    from simtrack.simulation.oracles import OracleDetectorConfig
     from simtrack.simulation.scene_file import load_scene
 
-    loaded = load_scene(scene)
+    loaded, oracle = load_scene(scene), OracleDetectorConfig()
+    if given:
+        from simtrack.evaluation.instrument.conditions import parse_conditions
+
+        conditions = parse_conditions(given)
+        loaded, oracle = conditions.scene(loaded), conditions.detector(oracle)
     folder = out if out is not None else Path("runs") / f"{loaded.name}-{seed}"
     config = RunConfig(
         scene=loaded, out=folder, duration=duration, seed=seed, agent=agent, detector=detector, renderer=renderer,
         overwrite=overwrite, log=log, compare_gaze=compare_gaze, threads=threads,
-        tracker=tracker, localizer=localizer, scene_graph=scene_graph, stage_limit=stage_limit,
+        tracker=tracker, localizer=localizer, scene_graph=scene_graph, stage_limit=stage_limit, oracle=oracle,
     )  # fmt: skip
     observers = _observers(view, rrd)
     with console.ProgressLine(f"{loaded.name} · seed {seed}") as line, cold_start_told(line.say):

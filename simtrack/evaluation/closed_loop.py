@@ -238,6 +238,8 @@ class ClosedLoopRun:
             self._moments.save(folder.path)
             if loop.watches:
                 write_faults(folder.path / "faults.csv", [fault for watch in loop.watches for fault in watch.faults])
+            if evaluator.changes is not None:
+                folder.write_changes(evaluator.changes.noticed())
             folder.write_graph(loop.stack.graph.to_json())
         return record
 

@@ -14,6 +14,7 @@ import numpy as np
 from simtrack.contracts import NANOSECONDS, Belief, LidarScan, RgbdFrame, SensorFrame
 from simtrack.evaluation.bop_recall import BopRecall
 from simtrack.evaluation.bounds import BoundEvaluator
+from simtrack.evaluation.changes import ChangeEvaluator
 from simtrack.evaluation.consistency import ConsistencyEvaluator
 from simtrack.evaluation.floor import FloorEvaluator, RegistrationFromTruth
 from simtrack.evaluation.identity import IdentityEvaluator
@@ -100,6 +101,11 @@ class Evaluator:
         }
         unknown = [name for name in truth.at(0).objects if truth.kind_of(name) != "catalogue"]
         self.found = ObjectsFoundEvaluator(truth.names, unknown)
+        self.changes: ChangeEvaluator | None = None
+        """Of scenes in which something happens unseen."""
+        if simulation.scene.changes:
+            sizes = {name: model.extents for name, model in simulation.world.objects.items() if model.name in models}
+            self.changes = ChangeEvaluator(truth, simulation.camera.intrinsics, sizes)
         self.album = Album(0, duration)
         self._scans: deque[LidarScan] = deque(maxlen=8)
         self._images: deque[RgbdFrame] = deque(maxlen=8)
@@ -119,7 +125,10 @@ class Evaluator:
         self._images.append(frame)
         truth, visibility = self._truth.at(belief.stamp), self._truth.visibility(belief.stamp)
         self.trajectory.observe(belief.stamp, belief.localization, truth.T_map_base)
-        objects = self.tracking.observe(belief.tracks, truth, {name: v.fraction for name, v in visibility.items()})
+        fractions = {name: v.fraction for name, v in visibility.items()}
+        objects = self.tracking.observe(belief.tracks, truth, fractions)
+        if self.changes is not None:
+            self.changes.observe(belief.tracks, truth, fractions, self._simulation.changes)
         self.identity.observe(objects, belief.tracks)
         self.consistency.observe_robot(belief.localization, truth.T_map_base)
         self.consistency.observe_objects(objects, {name: o.T_map_object for name, o in truth.objects.items()})
@@ -185,7 +194,8 @@ class Evaluator:
             self.trajectory, self.tracking, self.identity, self.consistency, self.bop, self.floor, self.bounds,
             self.relations, self.found, *self.presegmentation.values(),
         )  # fmt: skip
-        return {name: metric for part in parts for name, metric in part.metrics().items()}
+        changes = {} if self.changes is None else self.changes.metrics(self._simulation.pending_changes)
+        return {name: metric for part in parts for name, metric in part.metrics().items()} | changes
 
     def close(self) -> None:
         """Release ray scenes."""

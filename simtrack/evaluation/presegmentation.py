@@ -21,7 +21,7 @@ import numpy as np
 
 from simtrack.contracts import NANOSECONDS, Bool, Float64, Int32, LidarScan, Presegmentation, RgbdFrame, StaticMap
 from simtrack.evaluation.metrics import Metrics, ratio
-from simtrack.geometry.transforms import apply, interpolate
+from simtrack.geometry.transforms import apply, interpolate, transform
 
 if TYPE_CHECKING:
     from simtrack.raycast import RayScene
@@ -48,6 +48,9 @@ class Measurements:
     """Index of the thing that was truly hit, -1 = none."""
 
 
+_NOWHERE = transform(np.eye(3), (0.0, 0.0, -1e3))
+
+
 class ModelledSurfaces:
     """Distances from the surfaces that the stack has models of, objects at their true poses."""
 
@@ -59,8 +62,8 @@ class ModelledSurfaces:
         self._instances: dict[str, int] = {}
 
     def place(self, poses: Mapping[str, Float64]) -> None:
-        """Set the objects' (4, 4) T_map_object."""
-        self._poses.update({name: T for name, T in poses.items() if name in self._objects})
+        """Set the objects' (4, 4) T_map_object; what has none is not there."""
+        self._poses = {name: poses.get(name, _NOWHERE) for name in self._objects}
 
     def distances(self, points: Float64, limit: float) -> Float64:
         """(N,) metres from (N, 3) points in the map frame to the closest surface, inf beyond `limit`."""

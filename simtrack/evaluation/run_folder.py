@@ -4,13 +4,15 @@
 robot and of every object; ``trajectory.csv`` true and believed pose of the base; ``poses.csv`` one line an
 object-frame; ``simtrack_<scene>-test.csv`` results in the format of the BOP challenge; ``graph.json`` the scene
 graph; ``map.npz`` the surveyed map, as the stack has it; ``moments/`` the worst frames, for `simtrack debug`;
-``metrics.json``; ``report.html``. Of a run with stages that are not simtrack's: ``faults.csv``, the frames that they
+``metrics.json``; ``report.html``. Of a scene in which something happens unseen: ``changes.csv``, what could be noticed
+of it, and when it was. Of a run with stages that are not simtrack's: ``faults.csv``, the frames that they
 missed. Of a recording without a robot: ``frames.csv`` how its frames compare with ``map.ply``, the map that they make.
 """
 
 import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -19,6 +21,7 @@ import numpy as np
 
 from simtrack.contracts import Belief, Float64, StaticMap
 from simtrack.errors import InvalidValueError, OutputExistsError
+from simtrack.evaluation.changes import ObjectChange
 from simtrack.evaluation.metrics import Metric, write_atomically, write_metrics
 from simtrack.evaluation.run_truth import object_ids
 from simtrack.evaluation.tracking import ObjectFrame
@@ -26,7 +29,7 @@ from simtrack.geometry.transforms import quaternion_from_rotation
 
 OWN_FILES = (
     "config.yaml", "estimates.csv", "tracks.csv", "trajectory.csv", "poses.csv", "graph.json", "metrics.json",
-    "report.html", "frames.csv", "map.ply", "map.npz", "faults.csv",
+    "report.html", "frames.csv", "map.ply", "map.npz", "faults.csv", "changes.csv",
 )  # fmt: skip
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 TRAJECTORY = ("stamp_ns", "status", *(f"{who}_{c}" for who in ("true", "estimated") for c in _POSE))
@@ -40,6 +43,9 @@ TRACKS = ("stamp_ns", "track", "class", "status", *_POSE, "visible_fraction", "m
 FRAMES = (
     "stamp_ns", "status", "readings", "covered", "explained", "residual_median", "residual_p95", "difference_median",
     "unknown", "regions", "translation_error", "rotation_error", "map_faces",
+)  # fmt: skip
+CHANGES = (
+    "class", "kind", *(f"{when}_{c}" for when in ("before", "after") for c in "xyz"), "noticeable_ns", "noticed_ns",
 )  # fmt: skip
 BOP = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 
@@ -80,6 +86,24 @@ class RunFolder:
     def write_graph(self, text: str) -> None:
         """Replace ``graph.json``."""
         write_atomically(self.path / "graph.json", text)
+
+    def write_changes(self, noticed: Mapping[ObjectChange, tuple[int, int | None]]) -> None:
+        """Write ``changes.csv``; ``noticed_ns`` is empty where the belief has not followed in the end."""
+        nowhere = ("", "", "")
+        rows = [CHANGES] + [
+            (
+                change.class_name,
+                change.kind,
+                *(change.before or nowhere),
+                *(change.after or nowhere),
+                since,
+                "" if when is None else when,
+            )
+            for change, (since, when) in sorted(noticed.items(), key=lambda item: item[1][0])
+        ]
+        text = StringIO(newline="")
+        csv.writer(text, lineterminator="\n").writerows(rows)
+        write_atomically(self.path / "changes.csv", text.getvalue())
 
     def write_map(self, static_map: StaticMap) -> None:
         """Write ``map.npz``: the mesh of the surveyed map and which of its entities each face belongs to."""

@@ -7,6 +7,7 @@ Definitions
   depth image, symmetries respected.
 * Tracks are matched to objects of their class frame by frame: the assignment of least distance among pairs within 10
   cm. Only believed tracks (confirmed, occluded, out of view) take part.
+* An object is *occluded* (``tracking.occluded.*``) in scored object-frames with a visible fraction below 0.7.
 * An object is *moving* while its true speed exceeds 1 cm/s or 2 deg/s.
 * A *false track* is a confirmed one that matches no object for 1 s; a second track of the same object is one, too.
 * An *identity switch* is a match with another track than the one that the object was matched with last, however long
@@ -35,6 +36,8 @@ GATE = 0.10
 """Metres: a track farther away from every object of its class matches none."""
 VISIBLE = 0.3
 """Visible fraction from which on an object-frame is scored."""
+OCCLUDED = 0.7
+"""Visible fraction below which a scored object counts as occluded."""
 MOVING_LINEAR, MOVING_ANGULAR = 0.01, np.radians(2.0)
 """m/s and rad/s from which on an object is moving."""
 KNOWN_TRANSLATION, KNOWN_ROTATION = 0.02, np.radians(10.0)
@@ -248,7 +251,13 @@ class TrackingEvaluator:
             metrics[f"tracking.{kind}.object_frames"] = measured(np.count_nonzero(chosen & seen), "1")
         metrics["tracking.rotation_error.median"] = quantile(table.rotation[seen & tracked], 0.5, "rad", missing)
         metrics["tracking.map.translation_error.median"] = quantile(table.map_translation[tracked], 0.5, "m", missing)
+        hidden = table.occluded
+        errors = table.translation[hidden & tracked]
+        metrics["tracking.occluded.translation_error.median"] = quantile(errors, 0.5, "m", missing)
+        metrics["tracking.occluded.object_frames"] = measured(np.count_nonzero(hidden), "1")
         missing = "no object was visible enough"
+        recalled = np.count_nonzero(table.correct & hidden)
+        metrics["tracking.occluded.recall"] = ratio(recalled, np.count_nonzero(hidden), "no object was occluded")
         scored = int(np.count_nonzero(seen))
         metrics["tracking.recall"] = ratio(np.count_nonzero(table.correct & seen), scored, missing)
         metrics["tracking.add_s_auc"] = measured(auc(table.add[seen]), "1") if scored else unmeasured("1", missing)
@@ -273,6 +282,7 @@ class _Table:
             return np.fromiter(values, float, len(frames))
 
         self.scored = flags(f.scored for f in frames)
+        self.occluded = flags(f.scored and f.visible_fraction < OCCLUDED for f in frames)
         self.moving = flags(f.moving for f in frames)
         self.tracked = flags(f.track is not None for f in frames)
         self.correct = flags(f.correct for f in frames)

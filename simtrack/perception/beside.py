@@ -7,10 +7,11 @@ A robot that cannot wait hands over ``wait=False``: an answer that is not there 
 first frame that finds it. Then beliefs do depend on the machine.
 """
 
+import os
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from threading import Condition
 from typing import Generic, TypeVar
 
 from simtrack.contracts import NANOSECONDS
@@ -19,14 +20,30 @@ from simtrack.errors import InvalidValueError
 T = TypeVar("T")
 
 
-def worker(name: str) -> ThreadPoolExecutor:
+NICENESS = 10
+"""Of work that no frame waits for: where processors are short, the frames go first."""
+
+
+def worker(name: str, wait: bool = True) -> ThreadPoolExecutor:
     """A thread for work beside the frames, made at first use; compiled kernels run in it on one thread each.
 
     Kernels release the interpreter lock, so it is a second processor that does the work.
+
+    Args:
+        name: of the thread.
+        wait: whether frames wait for the work; if not, it leaves the processor to them.
     """
+    return ThreadPoolExecutor(1, f"simtrack-{name}", _settle_down, (-20 if wait else NICENESS,))
+
+
+def _settle_down(least_niceness: int) -> None:
+    """Prepare the calling thread for work beside the frames."""
     import numba
 
-    return ThreadPoolExecutor(1, f"simtrack-{name}", numba.set_num_threads, (1,))
+    numba.set_num_threads(1)
+    if hasattr(os, "setpriority"):
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, max(least_niceness, os.getpriority(os.PRIO_PROCESS, thread)))
 
 
 class Beside(Generic[T]):
@@ -58,6 +75,11 @@ class Beside(Generic[T]):
         if self._work is None or stamp - self._work[0] < self._period:
             return False
         return self._wait or self._work[1].done()
+
+    @property
+    def keeps_waiting(self) -> bool:
+        """Whether settling now would have to wait, though nobody is to wait for this piece."""
+        return not self._wait and self._work is not None and not self._work[1].done()
 
     def settle(self) -> T:
         """End the piece and give its answer; waits for it if need be. Raises what the work raised."""
@@ -94,7 +116,7 @@ class Paced(Generic[T]):
             wait: see the module.
         """
         self._step, self._wait = round(seconds * NANOSECONDS), wait
-        self._steps, self._ended, self._changed = 0, False, Condition()
+        self._steps, self._ended, self._changed = 0, False, threading.Condition()
         self._future = thread.submit(self._run, work)
 
     def _run(self, work: Callable[[Callable[[], None]], T]) -> T:

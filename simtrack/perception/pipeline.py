@@ -8,7 +8,8 @@ each in a thread of its own, and taken up a fixed time of the sensor's clock lat
 
 - *a scan's pose correction*: begun when the scan arrives, with the odometry so far and the tracks of the last image;
   taken up `correction_time` after the scan's last shot; until then odometry leads on from the correction before it.
-  Where that one left doubts (after the start, while lost), nothing is better than to wait: it is taken up at once.
+  Where that one left doubts (after the start, while lost), nothing is better than to wait: it is taken up at once. A
+  live robot does not wait (`StackConfig.live`); it lets scans go by while it is at work on one.
 - *segmenting a scan*: begun when its correction is taken up, with the poses of its shots; taken up `segmentation_time`
   after that.
 - *segmenting an image*, one that the detector would take: begun with its pose and its tracks; taken up
@@ -147,7 +148,7 @@ class PerceptionStack:
             c.segmentation_time,
             c.wait,
         )
-        self._correction_thread = worker("localization")
+        self._correction_thread = worker("localization", c.wait)
         self._correction = Beside[Localization](self._correction_thread, c.correction_time, c.wait)
         self.localizer = localizer or self._mesh_localizer(static_map, T_map_base)
         self.tracker = tracker or ObjectTracker(models, self.config.tracker)
@@ -232,13 +233,15 @@ class PerceptionStack:
                 localization = self._guard("localization", lambda: self.localizer.update(scan), None)
             self._located(scan, localization, end)
             return
+        if self._correction.keeps_waiting:
+            return  # a live robot lets this scan go by
         if self._scan is not None:
             self._settle_scan(self._scan, end)
         self._believe()
         self._own_shots, self._scan_joints = None, self._joint_positions(scan.stamp)
         self._scan = scan
         self._correction.begin(end, self.localizer.begin(scan))
-        if not self._sure:
+        if not self._sure and self.config.wait:
             self._settle_scan(scan, end)
 
     def _settle_scan(self, scan: LidarScan, now: int) -> None:

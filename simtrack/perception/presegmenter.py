@@ -40,7 +40,7 @@ class Presegmenter:
             wait: see `simtrack.perception.beside`.
         """
         self._believed, self._body, self._config = believed, body, config
-        self._thread = worker("presegmentation")
+        self._thread = worker("presegmentation", wait)
         self.image = Beside[Presegmentation](self._thread, image_time, wait)
         self.scan = Beside[Presegmentation](self._thread, scan_time, wait)
 

@@ -13,6 +13,7 @@ from simtrack.geometry.transforms import apply, difference, inverse
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 from simtrack.simulation.contacts import SUPPORTING, contact_pairs
 from simtrack.simulation.history import History
+from simtrack.simulation.placement import DEEP
 from simtrack.simulation.world import SENSOR_BODIES, World, body_pose
 from simtrack.simulation.world_rays import WorldRays
 
@@ -53,6 +54,7 @@ class Truth:
     T_map_lidar: Float64
     """(4, 4)."""
     objects: Mapping[str, ObjectTruth]
+    """By name; what is away from the world is missing."""
     contacts: frozenset[tuple[str, str]]
     """(supported, supporter): touches it from above; supporters are objects or furniture."""
     touching: frozenset[tuple[str, str]]
@@ -128,6 +130,7 @@ class GroundTruth:
                 difference(around[1][name], around[0][name]) / seconds,
             )
             for name, body in self._movable.items()
+            if scratch.xpos[body, 2] > -DEEP / 2
         }  # fmt: skip
         contacts, touching = self._contacts.at(stamp)
         base = body_pose(scratch, self._world.bodies["robot"])

@@ -26,6 +26,8 @@ DROP = 0.002
 """Metres above the face from which an object settles."""
 EDGE = 0.01
 """Metres that an object's outline keeps from the edge of its face."""
+DEEP, SPARE = 30.0, 3.0
+"""Metres below the floor at which things wait that are away, and between them."""
 ROBOT_RADIUS = 0.32
 """Metres: the base with a margin."""
 
@@ -144,8 +146,7 @@ def place_objects(
     areas: dict[str, Area | None] = {}
     for where, thing in things:
         try:
-            place = thing.place
-            areas[thing.id] = support_area(world, place.on, place.face, place.x, place.y) if place.on else None
+            areas[thing.id] = place_area(world, thing.place)
         except (UnknownNameError, InvalidValueError) as error:
             raise FileFormatError(scene.path, f"{where}.place", str(error)) from error
     # Large things first: they are the hardest to fit.
@@ -154,7 +155,11 @@ def place_objects(
     for _ in range(RESTARTS):
         placed: dict[str, Float64] = {}
         for where, thing in ordered:
-            pose = _draw(thing.place, areas[thing.id], models[thing.id], placed, models, rng)
+            if thing.place.away:
+                placed[thing.id] = out_of_the_world(list(models).index(thing.id))
+                continue
+            others = [outline(models[name].extents, T) for name, T in placed.items()]
+            pose = draw_place(thing.place, areas[thing.id], models[thing.id], others, rng)
             if pose is None:
                 stuck = f"{where} ({thing.id})"
                 break
@@ -166,18 +171,27 @@ def place_objects(
     )
 
 
-def _draw(
-    place: Placement,
-    area: Area | None,
-    model: ObjectModel,
-    placed: dict[str, Float64],
-    models: dict[str, ObjectModel],
-    rng: np.random.Generator,
+def place_area(world: StaticWorld, place: Placement) -> Area | None:
+    """The part of a support face on which a thing may be put; None if it is not put onto one.
+
+    Raises:
+        UnknownNameError, InvalidValueError: see `support_area`.
+    """
+    return support_area(world, place.on, place.face, place.x, place.y) if place.on else None
+
+
+def out_of_the_world(number: int) -> Float64:
+    """(4, 4) pose at which the thing of a number waits while it is away: far below the floor, and far from others."""
+    return transform_xyz_rpy((SPARE * number, 0.0, -DEEP), (0.0, 0.0, 0.0))
+
+
+def draw_place(
+    place: Placement, area: Area | None, model: ObjectModel, others: Sequence[Outline], rng: np.random.Generator
 ) -> Float64 | None:
+    """(4, 4) T_map_object of a thing that is not away, free of all others; None if none was found."""
     if place.pose is not None:
         return transform_xyz_rpy(place.pose.xyz, place.pose.rpy)
     assert area is not None
-    others = [outline(models[name].extents, T) for name, T in placed.items()]
     for _ in range(TRIES):
         pose = area.draw(model.extents, place.yaw, rng)
         if pose is not None and is_free(outline(model.extents, pose), others, place.separation):

@@ -31,7 +31,7 @@ class Pose(Strict):
 
 
 class Placement(Strict):
-    """Where a thing stands at time 0, before physics has settled it. Give either `on` or `pose`."""
+    """Where a thing stands, before physics has settled it. Give one of `on`, `pose` and `away`."""
 
     on: str | None = None
     """Name of a furniture part of the static world with a support face."""
@@ -45,11 +45,14 @@ class Placement(Strict):
     separation: float = Field(default=0.03, ge=0.0, le=1.0)
     """Least free distance to everything else on the face, metres."""
     pose: Pose | None = None
+    away: bool = False
+    """Nowhere in the world: until a change of the scene brings it, or from one on."""
 
     @model_validator(mode="after")
     def _one_of(self) -> "Placement":
-        if (self.on is None) == (self.pose is None):
-            raise PydanticCustomError("placement", "give either 'on' (name of a support) or 'pose', not both", {})
+        if (self.on is not None) + (self.pose is not None) + self.away != 1:
+            message = "give exactly one of 'on' (name of a support), 'pose' and 'away: true'"
+            raise PydanticCustomError("placement", message, {})
         return self
 
 
@@ -181,6 +184,15 @@ class HandSettings(Strict):
     script: tuple[Action, ...] = Field(min_length=1, max_length=200)
 
 
+class Change(Strict):
+    """While the robot looks elsewhere, somebody puts an object at another place, takes it away or brings it."""
+
+    at: Range
+    """Seconds: it happens as soon from then on as neither the object nor its new place is in view."""
+    object: Name
+    to: Placement
+
+
 class SensorSettings(Strict):
     """Sensors: presets and deviations from them. Each mapping holds fields of the configuration that it names."""
 
@@ -218,6 +230,8 @@ class SceneFile(Strict):
     """Things that it has no models of."""
     robot: RobotSettings
     hand: HandSettings | None = None
+    changes: tuple[Change, ...] = Field(default=(), max_length=MAX_INSTANCES)
+    """What happens unseen, each on its own."""
     sensors: SensorSettings = SensorSettings()
     survey: dict[str, Any] = Field(default_factory=dict)
     """Fields of `SurveyConfig`."""
@@ -241,10 +255,13 @@ class SceneFile(Strict):
         if twice := sorted({name for name in names if names.count(name) > 1}):
             message = "object names must be unique, but {twice} occurs more than once; give them a 'name'"
             raise PydanticCustomError("unique", message, {"twice": ", ".join(twice)})
-        for name in self._script_names():
+        said = [("hand.script", name) for name in self._script_names()]
+        said += [("changes", change.object) for change in self.changes]
+        for where, name in said:
             if name not in names:
-                message = "hand.script names the object '{name}'; the scene has: {names}"
-                raise PydanticCustomError("reference", message, {"name": name, "names": ", ".join(sorted(names))})
+                message = "{where} names the object '{name}'; the scene has: {names}"
+                known = ", ".join(sorted(names))
+                raise PydanticCustomError("reference", message, {"where": where, "name": name, "names": known})
         return self
 
     def _script_names(self) -> Iterator[str]:

@@ -19,8 +19,32 @@ from simtrack.simulation.world import TIMESTEP_NS, World
 if TYPE_CHECKING:
     import mujoco
 
+NUDGE = 1e-3
+"""m/s downwards with which a thing begins to settle: what has a speed is awake."""
 SETTLE_SECONDS = 1.5
 """How long physics lets things come to rest before time 0."""
+
+
+def put(world: World, data: "mujoco.MjData", name: str, T_map_object: Float64, *, floating: bool = False) -> None:
+    """Put an object somewhere else, at rest.
+
+    Args:
+        world: that it belongs to.
+        data: the state that changes.
+        name: of the object.
+        T_map_object: (4, 4), where it is put.
+        floating: without weight, until it is put somewhere again.
+    """
+    joint, body = world.model.joint(f"object/{name}"), world.bodies[name]
+    at, speed = int(joint.qposadr[0]), int(joint.dofadr[0])
+    data.qpos[at : at + 3] = T_map_object[:3, 3]
+    data.qpos[at + 3 : at + 7] = quaternion_from_rotation(T_map_object[:3, :3])
+    data.qvel[speed : speed + 6] = 0.0
+    data.xfrc_applied[body] = 0.0
+    if floating:
+        data.xfrc_applied[body, :3] = -world.model.body_mass[body] * world.model.opt.gravity
+    else:
+        data.qvel[speed + 2] = -NUDGE
 
 
 def rearrange(world: World, seed: int) -> None:
@@ -63,10 +87,10 @@ def settle(world: World, poses: Mapping[str, Float64], start: tuple[float, float
 
     scene, model, data = world.scene, world.model, world.data
     mujoco.mj_resetData(model, data)
+    away = {thing.id for thing in (*scene.objects, *scene.clutter) if thing.place.away}
     for name, T in poses.items():
-        address = int(model.joint(f"object/{name}").qposadr[0])
-        data.qpos[address : address + 3] = T[:3, 3]
-        data.qpos[address + 3 : address + 7] = quaternion_from_rotation(T[:3, :3])
+        put(world, data, name, T, floating=name in away)
+    data.qvel[:] = 0.0
     world.controller = controller = standing(scene, model, world.robot)
     controller.place(data, *start)
     mujoco.mj_step(model, data, nstep=round(SETTLE_SECONDS / (TIMESTEP_NS * 1e-9)))

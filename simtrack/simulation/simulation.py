@@ -1,6 +1,6 @@
 """The clock: runs physics, hand and robot, and lets every sensor look at its own time."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
 from types import TracebackType
@@ -27,6 +27,7 @@ from simtrack.sensors.camera import XTION, CameraModel
 from simtrack.sensors.faults import CalibrationFaults, FaultyFeed, FeedFaults
 from simtrack.sensors.lidar import VLP16, LidarModel, LidarNoiseConfig, apply_lidar_noise, reflected_intensity
 from simtrack.sensors.odometry import EncoderNoiseConfig, OdometryNoiseConfig, OdometrySensor, read_encoders
+from simtrack.simulation.changes import ChangeDirector, UnseenChange
 from simtrack.simulation.ground_truth import GroundTruth
 from simtrack.simulation.hand_script import HandDirector
 from simtrack.simulation.history import KEY_NS, History
@@ -154,6 +155,7 @@ class Simulation:
         self.seed = seed
         self._configure()
         self._hand = HandDirector(self.world, stream(seed, "hand")) if self.scene.hand is not None else None
+        self._changes = ChangeDirector(self.world, self.camera.intrinsics, seed)
         self._counts: dict[str, int] = dict.fromkeys(SENSORS, 0)
         self.world.controller.timestep = self._servo / NANOSECONDS
         self._now = 0
@@ -254,6 +256,7 @@ class Simulation:
             raise RenderingError("the simulation is closed; make a new one")
         self._counts["camera"] += 1
         target = self._counts["camera"] * self.camera_period
+        self._changes.step(self._now)
         while self._history.end < target:
             self._step(command)
         self._due(self._proprioception, "proprioception", target, self._send_proprioception)
@@ -272,6 +275,16 @@ class Simulation:
         """Body poses at a stamp, to be read before the next call: for what acts inside of the world."""
         self._history.load(stamp, self._scratch)
         return self._scratch
+
+    @property
+    def changes(self) -> Sequence[UnseenChange]:
+        """What has happened unseen so far."""
+        return self._changes.done
+
+    @property
+    def pending_changes(self) -> int:
+        """How many changes of the scene have not happened yet."""
+        return self._changes.pending
 
     def carry_robot(self, x: float, y: float, yaw: float) -> None:
         """Lift the robot and put it down at rest elsewhere, now: its wheels do not feel it (kidnapping).

@@ -131,6 +131,18 @@ def test_a_tracker_that_cannot_be_loaded_is_refused(tmp_path: Path) -> None:
     assert "allowed" in refused("run", "--stage-limit", 0, "--out", tmp_path / "run")
 
 
+def test_conditions_reach_the_scene_and_are_refused_if_unknown(tmp_path: Path) -> None:
+    import yaml
+
+    short = "--duration", "0.1", "--renderer", "embree", "--out", tmp_path / "run"
+    command("run", "workbench", "--given", "noise=0,latency=0.25", *short)
+    config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text(encoding="utf-8"))
+    assert config["oracle"]["latency"] == 0.25
+    assert config["scene_file"]["sensors"]["lidar_noise"]["sigma"] == 0.0
+    told = refused("run", "workbench", "--given", "fog=1")
+    assert "fog" in told and "noise" in told
+
+
 def test_a_stop_keeps_what_was_measured(tmp_path: Path) -> None:
     path = tmp_path / "stopped"
     process = start("run", "--duration", 600, "--renderer", "embree", "--out", path)

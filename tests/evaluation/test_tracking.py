@@ -55,6 +55,19 @@ def test_untracked_objects_are_misses_only_where_they_can_be_seen(world, scorers
     assert result["world.known_share"] == pytest.approx(1 / 3)
 
 
+def test_half_hidden_objects_are_told_apart(world, scorers) -> None:
+    evaluator = TrackingEvaluator(scorers)
+    tracks = [world.track("relay-a", 1), world.track("relay-b", 2, xi=(0, 0.004, 0, 0, 0, 0))]
+    evaluator.observe(tracks, world.truth(0), {"relay-a": 0.9, "relay-b": 0.5, "meter": 0.6})
+    result = values(evaluator)
+    assert result["tracking.occluded.object_frames"] == 2
+    assert result["tracking.occluded.recall"] == 0.5
+    assert result["tracking.occluded.translation_error.median"] == pytest.approx(0.004)
+    evaluator = TrackingEvaluator(scorers)
+    evaluator.observe(tracks, world.truth(0), SEEN)
+    assert values(evaluator)["tracking.occluded.recall"] is None
+
+
 def test_matching_is_one_to_one_and_within_ten_centimetres(world) -> None:
     near_both = world.track("relay-a", 1, xi=(0, 0.04, 0, 0, 0, 0))
     duplicate = world.track("relay-a", 2, xi=(0, 0.01, 0, 0, 0, 0))

@@ -1,5 +1,6 @@
 """What is done beside the frames is taken up when the stamps say so, whatever the threads do."""
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -25,7 +26,7 @@ from simtrack.geometry.meshes import box_mesh
 from simtrack.geometry.transforms import transform
 from simtrack.objects.tiago import tiago
 from simtrack.perception import beside
-from simtrack.perception.beside import Beside, Paced, worker
+from simtrack.perception.beside import NICENESS, Beside, Paced, worker
 from simtrack.perception.pipeline import PerceptionStack, StackConfig
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 
@@ -229,3 +230,43 @@ def test_paced_work_of_who_does_not_wait_has_no_end_before_it_has_ended() -> Non
     assert paced.settle() == 7
     thread.shutdown()
     assert paced.end(0, NANOSECONDS) == NANOSECONDS // 50 and paced.end(0, NANOSECONDS // 100) is None
+
+
+def test_a_live_robot_goes_on_while_it_is_at_work_on_a_scan(room: StaticMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    timed, gate = beside._timed, threading.Event()
+
+    def stuck(work: Callable[[], object]) -> tuple[object, float]:
+        gate.wait(20.0)
+        return timed(work)
+
+    monkeypatch.setattr(beside, "_timed", stuck)
+    feed = _feed(room, 0.7)
+    stack = PerceptionStack(room, {}, tiago(), Asked(), T_map_base=START, config=StackConfig.live())
+    try:
+        stuck_beliefs = [belief for frame in feed if (belief := stack.process(frame)) is not None]
+        assert [b.stamp for b in stuck_beliefs] == [f.stamp for f in feed if isinstance(f, RgbdFrame)]
+        assert all(belief.lidar is None and belief.camera is None for belief in stuck_beliefs)
+        gate.set()
+        later = [replace(f, stamp=f.stamp + NANOSECONDS) for f in feed]
+        beliefs = []
+        for frame in later:
+            time.sleep(0.002)
+            beliefs.append(stack.process(frame))
+        sure = [float(np.trace(b.localization.covariance)) for b in beliefs if b is not None]
+        assert min(sure) < 0.1 * float(np.trace(stuck_beliefs[-1].localization.covariance))
+    finally:
+        gate.set()
+        stack.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "getpriority"), reason="this system knows no niceness of threads")
+def test_work_that_no_frame_waits_for_leaves_the_processor_to_the_frames() -> None:
+    def niceness() -> int:
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    own, waited, unwaited = niceness(), worker("a"), worker("b", wait=False)
+    assert waited.submit(niceness).result() == own
+    assert unwaited.submit(niceness).result() == min(19, max(own, NICENESS))
+    assert niceness() == own
+    for thread in (waited, unwaited):
+        thread.shutdown()

@@ -55,7 +55,7 @@ def test_users_folder_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ("colour", "red", r"unknown field colour; allowed: .*clutter"),
         ("static.builder", "castle", r"static\.builder.*'lab_room', 'office_floor'"),
         ("objects.0.place.yaw", [1.0, 0.0], r"objects\.0\.place.*low must not exceed high"),
-        ("objects.0.place", {}, r"objects\.0\.place.*give either 'on'"),
+        ("objects.0.place", {}, r"objects\.0\.place.*exactly one of 'on'"),
         ("objects.1.model", "materialbox", r"unique.*materialbox"),
         ("robot.torso", 0.5, r"robot\.torso.*0\.35"),
         ("robot.torso", float("nan"), r"robot\.torso.*finite"),

@@ -16,7 +16,8 @@ MORE_IS_BETTER = (
 )  # fmt: skip
 """Parts of the names of metrics of which more is better; of all others less is."""
 HEADLINE = (
-    "tracking.recall", "tracking.add_s_auc", "tracking.hota", "tracking.static.translation_error.median",
+    "tracking.recall", "tracking.occluded.recall", "tracking.add_s_auc", "tracking.hota",
+    "tracking.occluded.translation_error.median", "tracking.static.translation_error.median",
     "tracking.static.translation_error.p95", "tracking.moving.translation_error.median",
     "tracking.rotation_error.median", "tracking.map.translation_error.median", "tracking.false_tracks",
     "tracking.id_switches", "tracking.reacquisition_time.p95", "localization.ate_rmse", "relations.f1",

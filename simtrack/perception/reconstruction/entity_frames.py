@@ -21,6 +21,8 @@ PARALLEL = float(np.cos(np.radians(12.0)))
 """Between upright surfaces of a carcass and its box; what is turned more is a door that stands open."""
 LEANS = float(np.sin(np.radians(4.0)))
 """Sine of the angle off upright and off level from which a plane leans."""
+FLAT = 0.6
+"""Share of the largest side of its box that a plane must fill for a thing to be turned that was not seen to lean."""
 LEVEL, BESIDE = float(np.cos(np.radians(3.0))), 0.1
 """|z| of the normal of a level plane, and the share of the largest plane's area from which it counts."""
 SLICE = 0.02
@@ -40,15 +42,21 @@ def frames(node: EntityNode, graph: ContactGraph) -> tuple[tuple[EntityNode, Flo
     """The node as it is compared, and (4, 4) what puts a model that was found so back into the map."""
     assert node.shape is not None
     T_back = leaning_turn(node) if node.kind is EntityKind.RIGID else None
-    if T_back is not None:
+    leans = any(lean.child == node.name for lean in graph.leaning)
+    if T_back is not None and (leans or _flat(node)):
         righted = node.moved(inverse(T_back) @ node.T_map_entity), T_back
-        leans = any(lean.child == node.name for lean in graph.leaning)
         return (righted,) if leans else ((node, np.eye(4)), righted)
     if node.kind is EntityKind.ARTICULATED:
         carcass = carcass_box(node)
         if carcass is not None:
             return (node, np.eye(4)), (replace(node, box=carcass), np.eye(4))
     return ((node, np.eye(4)),)
+
+
+def _flat(node: EntityNode) -> bool:
+    """Whether a thing is known by a broad face, not by a strip or a round side that one plane happens to fit."""
+    x, y, z = node.box.extents
+    return max(plane.area for plane in node.planes) >= FLAT * max(x * y, y * z, z * x)
 
 
 def leaning_turn(node: EntityNode) -> Float64 | None:

@@ -58,7 +58,7 @@ class ClaimQueue:
         """Claims, stamps at which they were handed to the thread, and what it does about them."""
         self._free = 0
         """Stamp at which the thread is taken to have ended the claim that was settled last, nanoseconds."""
-        self._thread = worker("claims")
+        self._thread = worker("claims", config.wait)
 
     def add(self, claim: Claim) -> None:
         """Queue a claim. It takes the turn of an older one about the same thing, or is dropped if that is at work."""

@@ -35,6 +35,12 @@ def _fixed_gaze(context: AgentContext) -> Agent:
     return FixedGazeAgent(context.start)
 
 
+def _patrol(context: AgentContext) -> Agent:
+    from simtrack.simulation.agents.patrol import PatrolAgent
+
+    return PatrolAgent(context.static_map, context.intrinsics, context.start)
+
+
 def _route(context: AgentContext) -> Agent:
     from simtrack.simulation.agents.route import RouteAgent
 
@@ -44,6 +50,7 @@ def _route(context: AgentContext) -> Agent:
 AGENTS: dict[str, Callable[[AgentContext], Agent]] = {
     "explorer": _explorer,
     "fixed-gaze": _fixed_gaze,
+    "patrol": _patrol,
     "route": _route,
 }
 """Known agents by name."""

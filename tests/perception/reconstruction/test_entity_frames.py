@@ -76,3 +76,16 @@ def test_a_carcass_seen_from_its_front_alone_is_left_as_it_is() -> None:
     front = block((0.6, 0.01, 1.8), (0.0, -0.3, 0.0))
     sides = [block((0.01, 0.6, 1.8), (x, 0.0, 0.0)) for x in (-0.3, 0.3)]
     assert carcass_box(node_of(concatenate([front, *sides]))) is None
+
+
+def test_a_strip_of_a_round_side_does_not_turn_a_thing() -> None:
+    """Of a thing on the floor little was seen: a strip of its rounded top, and a patch of a side further down."""
+    strip = [(0.0, y, 0.18) for y in (-0.2, 0.2)] + [(0.066, y, 0.134) for y in (-0.2, 0.2)]
+    patch = [(0.09, y, z) for z in (0.03, 0.0) for y in (-0.05, 0.05)]
+    faces = np.array([(0, 2, 3), (0, 3, 1), (4, 6, 7), (4, 7, 5)], np.int32)
+    graph = corner(bag=("bag", Mesh(np.array(strip + patch), faces)))
+    node = graph.nodes["bag"]
+    assert leaning_turn(node) is not None
+    ((framed, T_back),) = frames(node, graph)
+    assert framed is node
+    np.testing.assert_array_equal(T_back, np.eye(4))
