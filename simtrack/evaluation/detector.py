@@ -32,7 +32,7 @@ STEPS = {"pnp": (0.02, 15.0), "depth": (0.02, 15.0), "registered": (0.005, 3.0)}
 """Poses after PnP, after the search with depth, after registration: metres and degrees within which one is good."""
 OUTCOMES = ("undetected", "no_pose", "misplaced", "misturned", "not_believed", "wrong", "good")
 """What becomes of an object: no box of it; no pose agrees with it; the search's best one is not good, in position or,
-that being good, in orientation, and none is believed; a good one is not believed; what is believed is not good; it is."""
+being good, in orientation, and none is believed; a good one is not believed; a believed one is not good; one is."""
 
 
 @dataclass(slots=True)
