@@ -1,4 +1,4 @@
-"""Average recall of the BOP challenge in a running loop: VSD, MSSD and MSPD over their thresholds.
+"""Average recall of the BOP challenge: VSD, MSSD and MSPD over their thresholds.
 
 Definitions and thresholds of Hodan et al., "BOP Challenge 2020 on 6D Object Localization", ECCVW 2020, section 2.2,
 with the visibility of bop_toolkit's mode ``bop19``. An object-frame that is scored and not tracked is a miss at every
@@ -69,14 +69,16 @@ class BopRecall:
         """Take the depth image and the object-frames of one stamp."""
         for thing in objects:
             if thing.scored:
-                hit = thing.track is not None
-                self._recalls.append(self._recall(frame, thing) if hit else (0.0, 0.0, 0.0))
+                T_est = thing.track.T_camera_object if thing.track is not None else None
+                self.take(frame, thing.class_name, T_est, thing.T_camera_object)
 
-    def _recall(self, frame: RgbdFrame, thing: ObjectFrame) -> tuple[float, float, float]:
+    def take(self, frame: RgbdFrame, name: str, T_est: Float64 | None, T_true: Float64) -> None:
+        """Take one object of a frame, its estimated and its true pose in the camera; None: it was not found."""
+        self._recalls.append((0.0, 0.0, 0.0) if T_est is None else self._recall(frame, name, T_est, T_true))
+
+    def _recall(self, frame: RgbdFrame, name: str, T_est: Float64, T_true: Float64) -> tuple[float, float, float]:
         """Shares of the thresholds that VSD, MSSD and MSPD keep."""
-        assert thing.track is not None
-        scorer, name = self._scorers[thing.class_name], thing.class_name
-        T_est, T_true, K = thing.track.T_camera_object, thing.T_camera_object, frame.intrinsics
+        scorer, K = self._scorers[name], frame.intrinsics
         points, poses = scorer.queries, self._equivalents[name]
         _, bundle, lengths = self._bundle(K)
         test = frame.depth[::STRIDE, ::STRIDE].astype(float)
@@ -108,15 +110,15 @@ class BopRecall:
         self._scene.set_enabled(instance, False)
         return np.where(np.isfinite(found), found, 0.0)
 
-    def metrics(self) -> Metrics:
-        """``tracking.bop.ar`` and its parts."""
-        names = ("tracking.bop.ar_vsd", "tracking.bop.ar_mssd", "tracking.bop.ar_mspd")
+    def metrics(self, prefix: str = "tracking.bop") -> Metrics:
+        """``PREFIX.ar`` and its parts."""
+        names = (f"{prefix}.ar_vsd", f"{prefix}.ar_mssd", f"{prefix}.ar_mspd")
         if not self._recalls:
             missing = "no object was visible enough"
-            return {name: unmeasured("1", missing) for name in (*names, "tracking.bop.ar")}
+            return {name: unmeasured("1", missing) for name in (*names, f"{prefix}.ar")}
         means = np.mean(self._recalls, axis=0)
         metrics = {name: measured(value, "1") for name, value in zip(names, means, strict=True)}
-        return metrics | {"tracking.bop.ar": measured(means.mean(), "1")}
+        return metrics | {f"{prefix}.ar": measured(means.mean(), "1")}
 
     def close(self) -> None:
         """Release the ray scene."""

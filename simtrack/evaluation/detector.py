@@ -8,12 +8,14 @@ from time import process_time
 import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Detection, Float64, RgbdFrame
+from simtrack.evaluation.bop_recall import BopRecall
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio
 from simtrack.evaluation.pose_errors import PoseScorer
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection.boxes import Box, overlap
 from simtrack.perception.detection.keypoint_detector import KeypointDetector
 from simtrack.perception.detection.pnp import project_points, solve_pose
+from simtrack.perception.detection.pose_search import PoseSearch
 from simtrack.perception.tracking.birth import FitConfig, Prober
 from simtrack.perception.tracking.registration import RegistrationConfig
 from simtrack.perception.tracking.target import tracked_model
@@ -27,7 +29,10 @@ SAME = 0.5
 LEAST_SCORE = 0.05
 """Boxes count from here on for average precision, which looks at all scores; keypoints as the detector is set."""
 STEPS = {"pnp": (0.02, 15.0), "depth": (0.02, 15.0), "registered": (0.005, 3.0)}
-"""Poses after PnP, after depth alignment, after registration: metres and degrees within which a pose is good."""
+"""Poses after PnP, after the search with depth, after registration: metres and degrees within which one is good."""
+OUTCOMES = ("undetected", "no_pose", "misplaced", "misturned", "not_believed", "wrong", "good")
+"""What becomes of an object: no box of it; no pose agrees with it; the search's best one is not good, in position or,
+being good, in orientation, and none is believed; a good one is not believed; a believed one is not good; one is."""
 
 
 @dataclass(slots=True)
@@ -43,6 +48,10 @@ class DetectorScores:
     """Keypoint errors over their stated standard deviations, both coordinates."""
     poses: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {step: [] for step in STEPS})
     """Step -> metres and degrees for each object, detected or not; infinite where there is no pose."""
+    outcomes: dict[str, list[str]] = field(default_factory=dict)
+    """Class -> one of `OUTCOMES` for each object."""
+    bop: Metrics = field(default_factory=dict)
+    """Average recalls of the BOP challenge after each step."""
     detections: int = 0
     false: int = 0
     seconds: list[float] = field(default_factory=list)
@@ -74,6 +83,12 @@ class DetectorScores:
             good = int(np.count_nonzero((known[:, 0] <= metres) & (known[:, 1] <= degrees)))
             # Of what was detected, as a tracker's births are tried from detections alone.
             out[f"poses.{step}.good"] = ratio(good, len(known), "no pose")
+            out[f"poses.{step}.recall"] = ratio(good, len(values), "no object was to be found")
+        out |= self.bop
+        for name in sorted(self.outcomes):
+            for outcome in OUTCOMES:
+                count = self.outcomes[name].count(outcome)
+                out[f"outcome.{name}.{outcome}"] = ratio(count, len(self.outcomes[name]), "no object was to be found")
         out["speed.detector"] = quantile(np.array(self.seconds[1:]), 0.5, "s", "no image")
         return out
 
@@ -99,6 +114,7 @@ def evaluate_detector(
             _score(scores, steps, detector, image)
             if told is not None:
                 told(done, of)
+        scores.bop = steps.bop()
     finally:
         steps.close()
     return scores
@@ -149,8 +165,26 @@ def _score(scores: DetectorScores, steps: "_PoseSteps", detector: KeypointDetect
             scores.normalised += [
                 float(v) for v in (errors / detection.keypoint_sigma[:, None]).ravel() if np.isfinite(v)
             ]
-        for step, errors in steps.errors(detection, model, frame, label.T_camera_object).items():
+        found = steps.errors(detection, model, frame, label.T_camera_object)
+        for step, errors in found.items():
             scores.poses[step].append(errors)
+        outcome = _outcome(found) if detection is not None else "undetected"
+        scores.outcomes.setdefault(model.name, []).append(outcome)
+
+
+def _outcome(errors: Mapping[str, tuple[float, float]]) -> str:
+    """What became of a detected object, by its errors after each step."""
+    if not np.isfinite(errors["depth"][0]):
+        return "no_pose"
+    if np.isfinite(errors["registered"][0]):
+        return "good" if _good("registered", *errors["registered"]) else "wrong"
+    if _good("depth", *errors["depth"]):
+        return "not_believed"
+    return "misturned" if errors["depth"][0] <= STEPS["depth"][0] else "misplaced"
+
+
+def _good(step: str, metres: float, degrees: float) -> bool:
+    return metres <= STEPS[step][0] and degrees <= STEPS[step][1]
 
 
 def nearest_alike(
@@ -183,30 +217,45 @@ class _PoseSteps:
             name: PoseScorer(np.asarray(model.mesh.vertices, float), model.symmetries, model.diameter)
             for name, model in models.items()
         }
+        self._search = PoseSearch(models)
         self._prober = Prober(RegistrationConfig(), FitConfig())
+        self._bop = {step: BopRecall(models, self._scorers) for step in STEPS}
 
     def close(self) -> None:
-        """Release the scene of rays."""
+        """Release the scenes of rays."""
+        self._search.close()
         self._prober.close()
+        for recall in self._bop.values():
+            recall.close()
 
     def errors(
         self, detection: Detection | None, model: ObjectModel, frame: RgbdFrame, T_true: Float64
     ) -> dict[str, tuple[float, float]]:
-        """Metres and degrees after each step."""
-        none = np.inf, np.inf
-        out = dict.fromkeys(STEPS, none)
+        """Metres and degrees after each step; infinite where there is no pose."""
+        out = {}
+        for step, T in self._poses(detection, model, frame).items():
+            self._bop[step].take(frame, model.name, T, T_true)
+            out[step] = (np.inf, np.inf) if T is None else self._compared(model.name, T, T_true)
+        return out
+
+    def bop(self) -> Metrics:
+        """Average recalls of all objects so far, after each step."""
+        return {k: v for step, recall in self._bop.items() for k, v in recall.metrics(f"bop.{step}").items()}
+
+    def _poses(self, detection: Detection | None, model: ObjectModel, frame: RgbdFrame) -> dict[str, Float64 | None]:
+        """T_camera_object after each step."""
+        out: dict[str, Float64 | None] = dict.fromkeys(STEPS)
         if detection is None:
             return out
         hypotheses = solve_pose(detection, model, frame.intrinsics, frame.stamp)
+        if hypotheses:
+            out["pnp"] = hypotheses[0].T_camera_object
+        hypotheses = self._search.search(detection, frame.depth, frame.intrinsics, frame.stamp, hypotheses) or []
         if not hypotheses:
             return out
-        first, tracked = hypotheses[0], self._tracked[model.name]
-        out["pnp"] = self._compared(model.name, first.T_camera_object, T_true)
-        aligned = self._prober.aligned(first, tracked, frame.depth, frame.intrinsics, {})
-        out["depth"] = self._compared(model.name, aligned[0], T_true)
-        found = self._prober.best(hypotheses, tracked, frame.depth, frame.intrinsics, {})
-        if found is not None:
-            out["registered"] = self._compared(model.name, found.T_camera_object, T_true)
+        out["depth"] = hypotheses[0].T_camera_object
+        found = self._prober.best(hypotheses, self._tracked[model.name], frame.depth, frame.intrinsics, {})
+        out["registered"] = found.T_camera_object if found is not None else None
         return out
 
     def _compared(self, name: str, T: Float64, T_true: Float64) -> tuple[float, float]:

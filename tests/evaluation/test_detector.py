@@ -81,6 +81,10 @@ def test_the_truth_has_no_errors(image: LabelledImage, monkeypatch: pytest.Monke
     for step in ("pnp", "depth", "registered"):
         assert metrics[f"poses.{step}.good"] == 1.0
         assert metrics[f"poses.{step}.share"] == 1.0
+        assert metrics[f"poses.{step}.recall"] == 1.0
+        assert metrics[f"bop.{step}.ar"] > 0.9
+    for name in NAMES:
+        assert metrics[f"outcome.{name}.good"] == 1.0
     assert metrics["poses.pnp.translation.median"] < 1e-4
 
 
@@ -96,6 +100,9 @@ def test_errors_are_told_in_their_units(image: LabelledImage, monkeypatch: pytes
     assert metrics["boxes.false_share"] == 0.5
     assert metrics["boxes.ap50.relay"] == 0.0
     assert metrics["poses.pnp.share"] == 0.5
+    assert metrics["outcome.relay.undetected"] == 1.0
+    assert metrics["poses.registered.recall"] <= 0.5
+    assert metrics["bop.pnp.ar"] <= 0.5
     assert metrics["poses.depth.translation.median"] < metrics["poses.pnp.translation.median"] + 0.02
 
 
@@ -117,3 +124,14 @@ def test_scores_are_written(image: LabelledImage, monkeypatch: pytest.MonkeyPatc
     assert document["metrics"]["boxes.ap50"]["value"] == 0.0
     assert document["metrics"]["keypoints.error.median"]["value"] is None
     assert "poses.pnp.share" in (tmp_path / "detector.txt").read_text()
+
+
+def test_what_became_of_an_object_is_told_by_the_first_step_that_failed() -> None:
+    none, near, turned, far = (np.inf, np.inf), (0.001, 1.0), (0.001, 90.0), (0.05, 1.0)
+    steps = {
+        "no_pose": (none, none), "good": (far, near), "wrong": (near, turned), "not_believed": (near, none),
+        "misturned": (turned, none), "misplaced": (far, none),
+    }  # fmt: skip
+    for outcome, (depth, registered) in steps.items():
+        assert evaluation._outcome({"pnp": none, "depth": depth, "registered": registered}) == outcome
+    assert {*steps, "undetected"} == set(evaluation.OUTCOMES)

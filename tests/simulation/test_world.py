@@ -25,10 +25,8 @@ def test_separation_of_rectangles() -> None:
 def test_what_is_far_is_free_as_the_separation_says() -> None:
     rng = np.random.default_rng(0)
     for _ in range(300):
-        a, b = (
-            Outline(*rng.uniform(-0.5, 0.5, 2), rng.uniform(-3, 3), tuple(rng.uniform(0.01, 0.2, 2)), 0.0, 0.1)
-            for _ in range(2)
-        )
+        x, y, yaw, length, width = rng.uniform([-0.5, -0.5, -3.0, 0.01, 0.01], [0.5, 0.5, 3.0, 0.2, 0.2], (2, 5)).T
+        a, b = (Outline(x[k], y[k], yaw[k], (length[k], width[k]), 0.0, 0.1) for k in range(2))
         gap = rng.uniform(0.0, 0.3)
         assert is_free(a, [b], gap) == (separation(a, b) >= gap)
 

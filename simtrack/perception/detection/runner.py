@@ -10,6 +10,7 @@ from simtrack.contracts import (
     CameraIntrinsics,
     DetectionResult,
     Detector,
+    Float32,
     PoseHypothesis,
     RegionOfInterest,
     RgbdFrame,
@@ -19,6 +20,8 @@ from simtrack.errors import InvalidValueError
 from simtrack.objects import ObjectModel
 from simtrack.perception.beside import worker
 from simtrack.perception.detection.pnp import PnpConfig, solve_pose
+from simtrack.perception.detection.pose_search import PoseSearch, PoseSearchConfig
+from simtrack.perception.tracking.correspondences import usable_depth
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +33,7 @@ class RunnerConfig:
     timeout: float = 30.0
     """A call that has not returned after this, in seconds of the wall clock, is given up: the detector hangs."""
     pnp: PnpConfig = field(default_factory=PnpConfig)
+    search: PoseSearchConfig = field(default_factory=PoseSearchConfig)
 
     def __post_init__(self) -> None:
         if self.patience <= 0.0 or self.timeout <= 0.0:
@@ -56,6 +60,7 @@ class DetectorRunner:
         self._free_at: int | None = None
         self._waiting: list[tuple[DetectionResult, Future[list[PoseHypothesis]]]] = []
         self._solver: Executor | None = None
+        self._search = PoseSearch(models, self.config.search)
         self._hanging: threading.Thread | None = None
         self.status = Status.OK
 
@@ -76,9 +81,10 @@ class DetectorRunner:
             return None
         self.status, self._free_at = result.status, max(result.available, frame.stamp + 1)
         if self._solver is None:
-            self._solver = worker("pnp", threads=self._threads)
-        # Until the answer is due there is time to solve for the poses.
-        self._waiting.append((result, self._solver.submit(self._hypotheses, result, frame.intrinsics)))
+            self._solver = worker("poses", threads=self._threads)
+        # Until the answer is due there is time to look for the poses.
+        depth = usable_depth(frame.depth)
+        self._waiting.append((result, self._solver.submit(self._hypotheses, result, depth, frame.intrinsics)))
         return result
 
     def collect(self, now: int) -> list[PoseHypothesis]:
@@ -93,13 +99,18 @@ class DetectorRunner:
         if self._solver is not None:
             self._solver.shutdown()
             self._solver = None
+        self._search.close()
 
-    def _hypotheses(self, result: DetectionResult, intrinsics: CameraIntrinsics) -> list[PoseHypothesis]:
+    def _hypotheses(
+        self, result: DetectionResult, depth: Float32, intrinsics: CameraIntrinsics
+    ) -> list[PoseHypothesis]:
         hypotheses: list[PoseHypothesis] = []
         for detection in result.detections:
             model = self._models.get(detection.class_name)
             if model is not None and detection.keypoints.shape == (9, 2):
-                hypotheses += solve_pose(detection, model, intrinsics, result.stamp, self.config.pnp)
+                solved = solve_pose(detection, model, intrinsics, result.stamp, self.config.pnp)
+                found = self._search.search(detection, depth, intrinsics, result.stamp, solved)
+                hypotheses += solved if found is None else found
         return hypotheses
 
     def _call(self, frame: RgbdFrame, regions: Sequence[RegionOfInterest]) -> DetectionResult | None:

@@ -79,7 +79,7 @@ def group_by_detection(hypotheses: Sequence[PoseHypothesis]) -> list[list[PoseHy
         for group in groups:
             first = group[0]
             q = first.T_camera_object[:3, 3]
-            same_ray = float(p @ q) > 0.9995 * float(np.linalg.norm(p) * np.linalg.norm(q))
+            same_ray = float(p @ q) > 0.998 * float(np.linalg.norm(p) * np.linalg.norm(q))
             if first.class_name == h.class_name and first.stamp == h.stamp and first.score == h.score and same_ray:
                 group.append(h)
                 break

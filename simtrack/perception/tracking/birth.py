@@ -46,6 +46,10 @@ class FitConfig:
     """... and so is one with a larger misfit than this."""
     misfit: float = 1.25
     """A fit with a larger misfit than this is not believed."""
+    near_support: float = 0.8
+    """Hypotheses with more support than this are registered as they are, and no others are ..."""
+    near_margin: float = 0.8
+    """... of which a further one is taken if it fits so much better."""
     modes: int = 3
     """Up to so many frequent depth differences are tried: the most frequent one may be that of an occluder."""
     survivors: int = 4
@@ -123,6 +127,9 @@ class Prober:
     ) -> RegistrationResult | None:
         """Register each alternative and return the one that fits best, or None if none can be believed."""
         self._show(model, occluders)
+        near = self._near(hypotheses, depth, intrinsics)
+        if near:
+            return self._settled(near, depth, intrinsics)
         starts = [T for h in hypotheses for T in self._aligned(h.T_camera_object, depth, intrinsics)]
         result = self._best_of(starts, depth, intrinsics)
         if result is not None and self._fit.promising < result.support and not self._good(result):
@@ -132,6 +139,33 @@ class Prober:
             return None
         turned = min(angle_between(result.T_camera_object[:3, :3], h.T_camera_object[:3, :3]) for h in hypotheses)
         return result if turned <= self._fit.turn else None
+
+    def _near(
+        self, hypotheses: Sequence[PoseHypothesis], depth: Float32, intrinsics: CameraIntrinsics
+    ) -> list[Float64]:
+        """Poses of the hypotheses that agree with the depth image as they are."""
+        judged = [
+            self._registration.assess(depth, intrinsics, {PROBE: h.T_camera_object}, self._fixed).get(PROBE)
+            for h in hypotheses
+        ]
+        return [r.T_camera_object for r in judged if r is not None and r.support >= self._fit.near_support]
+
+    def _settled(
+        self, poses: Sequence[Float64], depth: Float32, intrinsics: CameraIntrinsics
+    ) -> RegistrationResult | None:
+        """The best fit from poses that are nearly right, if it can be believed.
+
+        Of fits that are about as good the earlier one is taken: the detection knows more than the depth image.
+        """
+        found: RegistrationResult | None = None
+        for T in poses:
+            result = self._register(T, depth, intrinsics, self._refine)
+            if result is not None and (found is None or cost(result) < self._fit.near_margin * cost(found)):
+                found = result
+        if found is None or not self._good(found):
+            wider = self._best_of(poses, depth, intrinsics)
+            found = min((r for r in (found, wider) if r is not None), key=cost, default=None)
+        return found if found is not None and believable(found, self._fit) else None
 
     def _good(self, result: RegistrationResult) -> bool:
         return result.support >= self._fit.good_support and result.misfit <= self._fit.good_misfit
@@ -210,18 +244,6 @@ class Prober:
         self._show(other, {})
         theirs = self._registration.explained(depth, intrinsics, PROBE, T_camera_other)
         return float(np.count_nonzero(mine & theirs)) / max(int(np.count_nonzero(mine)), 1)
-
-    def aligned(
-        self,
-        hypothesis: PoseHypothesis,
-        model: TrackedModel,
-        depth: Float32,
-        intrinsics: CameraIntrinsics,
-        occluders: Occluders,
-    ) -> list[Float64]:
-        """(4, 4) poses: a hypothesis slid along its viewing ray to where depth was measured, the likeliest first."""
-        self._show(model, occluders)
-        return self._aligned(hypothesis.T_camera_object, depth, intrinsics)
 
     def _show(self, model: TrackedModel, occluders: Occluders) -> None:
         """Put a candidate and what stands around it into the scene, and nothing else."""
