@@ -218,7 +218,7 @@ def _solution(rays: Float64, sigma: Float64, distance_sigma: float) -> Float64:
     A[:-1:2, 0], A[1:-1:2, 1], A[-1, 2] = 1.0, 1.0, 1.0
     A[:-1:2, 2], A[1:-1:2, 2] = -rays[:, 0], -rays[:, 1]
     weights = np.append(np.repeat(1.0 / sigma, 2), 1.0 / distance_sigma)
-    return np.linalg.pinv(A * weights[:, None]) * weights
+    return np.asarray(np.linalg.pinv(A * weights[:, None]) * weights, np.float64)
 
 
 def _drawn_about(keypoints: Float64, box: Float64) -> bool:
