@@ -115,6 +115,7 @@ class ObjectTracker:
         self._take_detections(hypotheses)
         self._settle_claims(view.stamp)
         self._prune(view.stamp)
+        self._reunite()
         return TrackerResult(frame.stamp, self._tracks(view), status)
 
     def _register(self, view: View, status: Status, hypotheses: Sequence[PoseHypothesis]) -> None:
@@ -231,6 +232,17 @@ class ObjectTracker:
             stale = now - target.born > self.config.tentative_timeout * NANOSECONDS
             if target.status is TrackStatus.TENTATIVE and stale:
                 self._lose(target)
+
+    def _reunite(self) -> None:
+        """What turned up a moment before a known object of its class was seen to be gone is that object."""
+        for new in list(self._targets):
+            lost = [t for t in self._targets if not t.alive and t.model is new.model]
+            if lost and new.status is TrackStatus.TENTATIVE and not new.known:
+                before = max(lost, key=lambda t: t.last_seen)
+                self._targets.remove(before)
+                self._registration.remove(new.id)
+                new.id, new.known = before.id, True
+                self._registration.add(new.id, self._tracked[new.model.name])
 
     # -------------------------------------------------------------------------------------------------- late detections
 

@@ -173,6 +173,28 @@ def test_unusable_frames_are_statuses() -> None:
     film.tracker.close()
 
 
+def test_what_turns_up_before_its_loss_is_seen_keeps_its_identity() -> None:
+    film = Film("relay")
+    relay = film.put("relay", -0.15, 0.0, 0.5)
+    (before,) = film.run(15).tracks
+    assert before.status is TrackStatus.CONFIRMED
+    film.move(relay, scenes.on_bench(film.models["relay"], 0.15, 0.0, 0.5))
+    old = film.tracker._targets[0]
+    for _ in range(30):
+        old.missing_since = None  # not yet: something may have been in the way
+        tracks = film.run(1).tracks
+        if len(tracks) == 2:
+            break
+    assert [t.status for t in tracks] != [TrackStatus.CONFIRMED] * 2
+    film.tracker._lose(old)
+    (after,) = film.run(1).tracks
+    assert after.id == before.id
+    (after,) = film.run(10).tracks
+    assert (after.id, after.status) == (before.id, TrackStatus.CONFIRMED)
+    assert film.error(after, relay) < 0.003
+    film.tracker.close()
+
+
 def test_live_births_leave_the_frames_little_to_catch_up_with(monkeypatch: pytest.MonkeyPatch) -> None:
     film = Film("relay", config=TrackerConfig(wait=False))
     relay = film.put("relay", 0.1, -0.1, 1.0)
