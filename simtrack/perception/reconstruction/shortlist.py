@@ -132,7 +132,12 @@ def _fits(
 
 
 def could_lie(view: EntityView) -> bool:
-    """Whether enough was seen to believe that a thing does not stand as it is made to: sides of it, or faces."""
+    """Whether enough was seen to believe that a thing does not stand as it is made to: sides of it, or faces.
+
+    What has doors or drawers stands.
+    """
+    if view.node.kind is EntityKind.ARTICULATED:
+        return False
     flat = sum(plane.area for plane in view.node.planes)
     return bool(np.count_nonzero(view.open_sides) < _UNSEEN_SIDES or flat > _FLAT * view.area)
 

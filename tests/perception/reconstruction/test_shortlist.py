@@ -50,6 +50,17 @@ def test_an_open_door_is_seen() -> None:
     assert best.positions.get(joint.name, 0.0) == pytest.approx(0.5 * joint.upper)
 
 
+@pytest.mark.parametrize(("name", "lies"), [("bottle-square", True), ("cabinet-sideboard", False)])
+def test_what_has_doors_never_lies_on_its_side(name: str, lies: bool) -> None:
+    model = cad_model(name)
+    mesh = transformed(model.mesh(), transform(rotation_from_rpy(np.pi / 2, 0.0, 0.3)))
+    mesh = transformed(mesh, transform(None, (0.0, 0.0, -float(mesh.bounds[0, 2]))))
+    nodes, _ = entity_nodes([EntityMesh("thing", model.semantic_class, mesh)], np.random.default_rng(0))
+    graph = build_contact_graph(nodes)
+    found = shortlist(graph.nodes["thing"], graph, [model], replace(ALONE, tipped=4))
+    assert any(not candidate.upright for candidate in found) == lies
+
+
 def test_nothing_to_match() -> None:
     floor = EntityMesh("floor", "floor", box_mesh((4.0, 4.0, 0.1)))
     crate = EntityMesh("crate", "crate", transformed(box_mesh((0.4, 0.3, 0.2)), transform(None, (0.0, 0.0, 0.15))))

@@ -179,7 +179,7 @@ def test_what_turns_up_before_its_loss_is_seen_keeps_its_identity() -> None:
     (before,) = film.run(15).tracks
     assert before.status is TrackStatus.CONFIRMED
     film.move(relay, scenes.on_bench(film.models["relay"], 0.15, 0.0, 0.5))
-    old = film.tracker._targets[0]
+    old, tracks = film.tracker._targets[0], ()
     for _ in range(30):
         old.missing_since = None  # not yet: something may have been in the way
         tracks = film.run(1).tracks
