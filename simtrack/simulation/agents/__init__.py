@@ -36,9 +36,9 @@ def _fixed_gaze(context: AgentContext) -> Agent:
 
 
 def _patrol(context: AgentContext) -> Agent:
-    from simtrack.simulation.agents.patrol import PatrolAgent
+    from simtrack.simulation.agents.patrol import ROUNDS, PatrolAgent
 
-    return PatrolAgent(context.static_map, context.intrinsics, context.start)
+    return PatrolAgent(context.static_map, context.intrinsics, context.start, ROUNDS)
 
 
 def _route(context: AgentContext) -> Agent:

@@ -1,23 +1,14 @@
 """An agent that goes its rounds: it looks at every surface again and again, known or not."""
 
-from dataclasses import replace
-
-from simtrack.contracts import NANOSECONDS, Belief, CameraIntrinsics, Command, StaticMap
+from simtrack.contracts import NANOSECONDS, Belief
 from simtrack.simulation.agents.explorer import ExplorerAgent, ExplorerConfig
+
+ROUNDS = ExplorerConfig(memory=9.0, dwell=1.5)
+"""Each surface is looked at again after 9 s, for 1.5 s."""
 
 
 class PatrolAgent(ExplorerAgent):
-    """Explores anew what it has not looked at for a while; implements `simtrack.contracts.Agent`."""
-
-    def __init__(
-        self,
-        static_map: StaticMap,
-        intrinsics: CameraIntrinsics,
-        start: Command,
-        config: ExplorerConfig | None = None,
-    ) -> None:
-        """`config.memory` says after how many seconds a surface has to be looked at again, for `dwell` seconds."""
-        super().__init__(static_map, intrinsics, start, config or replace(ExplorerConfig(), memory=9.0, dwell=1.5))
+    """Explores anew what it has not looked at for `memory` seconds; implements `simtrack.contracts.Agent`."""
 
     def _remember(self, belief: Belief, elapsed: float) -> None:
         super()._remember(belief, elapsed)
