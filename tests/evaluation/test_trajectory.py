@@ -39,9 +39,7 @@ def test_what_was_believed_before_the_first_scans_were_matched_is_no_error() -> 
     evaluator = TrajectoryEvaluator(since=5 * TENTH)
     for k in range(30):
         status, off = (Status.DEGRADED, 0.5) if k < 3 else (Status.OK, 0.01)
-        evaluator.observe(
-            k * TENTH, Localization(k * TENTH, transform_planar(off, 0, 0), np.eye(6), status), np.eye(4)
-        )
+        evaluator.observe(k * TENTH, Localization(k * TENTH, transform_planar(off, 0, 0), np.eye(6), status), np.eye(4))
     metrics = evaluator.metrics()
     assert metrics["localization.ate_max"].value == pytest.approx(0.01)
     assert metrics["localization.rpe.translation.rmse"].value == pytest.approx(0.0, abs=1e-9)
