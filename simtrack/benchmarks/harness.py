@@ -104,7 +104,6 @@ def measure(
     repeats: int = 15,
     warmup: int = 2,
     before: Callable[[], object] | None = None,
-    primed: bool = False,
 ) -> dict[str, Timing]:
     """Time functions fairly: they take turns, so that a busy moment of the machine hits all of them.
 
@@ -113,9 +112,6 @@ def measure(
         repeats: turns of each; the medians are returned.
         warmup: turns that do not count (compilation, caches).
         before: called before each turn, not timed.
-        primed: a turn is a call that is not timed and then one that is. Without it the contestants find the
-            processor's caches as the one before left them: they are timed cold, which nothing that scans at a
-            sensor's rate is.
     """
     cpu: dict[str, list[float]] = {name: [] for name in contestants}
     wall: dict[str, list[float]] = {name: [] for name in contestants}
@@ -123,8 +119,6 @@ def measure(
         for name, work in contestants.items():
             if before is not None:
                 before()
-            if primed:
-                work()
             cpu_start, wall_start = time.process_time(), time.perf_counter()
             work()
             wall_end, cpu_end = time.perf_counter(), time.process_time()

@@ -180,16 +180,12 @@ def _cast(
     engines: Mapping[str, Engine],
     repeats: int,
 ) -> dict[str, Timing]:
-    """Nearest hits of a whole scan by everybody, and whether simtrack and embreex agree.
-
-    Each casts its scan twice and the second is timed, as in a stream of scans; the cold rows time simtrack and embreex
-    each after the other, which has taken the caches with a hierarchy of its own.
-    """
+    """Nearest hits of a whole scan by everybody, and whether simtrack and embreex agree."""
     out = RayHits.empty(len(scan.bundle))
     ours = partial(scene.cast, scan.bundle, scan.T_map_sensor, out=out)
     contestants: dict[str, Callable[[], object]] = {"simtrack": ours}
     contestants |= {name: cast for name, make in engines.items() if (cast := make(scan)) is not None}
-    timings = measure(contestants, repeats, before=_rest, primed=True)
+    timings = measure(contestants, repeats, before=_rest)
     for name, timing in timings.items():
         result.add(f"{scan.name}: {name}", timing)
     for name, timing in timings.items():
@@ -197,11 +193,6 @@ def _cast(
             asked = ASKED_RATIOS[scan.name][packet_width()] if name == "embreex run" else None
             ratio = timing.cpu / timings["simtrack"].cpu
             result.add(f"{scan.name}: {name} / simtrack", value=ratio, unit="x", asked=asked, sense="at least")
-    cold = measure({name: contestants[name] for name in ("simtrack", "embreex run")}, repeats, before=_rest)
-    for name, timing in cold.items():
-        result.add(f"{scan.name}, caches cold: {name}", timing)
-    ratio = cold["embreex run"].cpu / cold["simtrack"].cpu
-    result.add(f"{scan.name}, caches cold: embreex run / simtrack", value=ratio, unit="x")
     differing = _differing(ours(), contestants["embreex run"]())
     result.add(f"{scan.name}: rays on which simtrack and embreex differ", value=float(differing), unit="rays")
     return timings
