@@ -34,7 +34,7 @@ from simtrack.evaluation.tracking import ObjectFrame, TrackingEvaluator
 from simtrack.evaluation.trajectory import SETTLED, TrajectoryEvaluator
 from simtrack.geometry.transforms import angle_between
 from simtrack.objects import ObjectModel
-from simtrack.perception.pipeline import StackConfig
+from simtrack.perception.stack_config import StackConfig
 from simtrack.simulation.simulation import Simulation
 
 PERIOD = NANOSECONDS // 2
