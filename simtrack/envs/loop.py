@@ -106,7 +106,9 @@ class Loop:
             simulation.static_map,
             simulation.models,
             simulation.robot,
-            OracleDetector(simulation.truth, simulation.models, seed, errors),
+            OracleDetector(
+                simulation.truth, simulation.models, seed, errors, simulation.calibration.camera_time_offset
+            ),
             T_map_base=simulation.start,
             config=_without_threads(stack_config(pixel_scale(simulation.camera))),
         )
