@@ -13,9 +13,9 @@ def score(
 ) -> int:
     """Score results that were made elsewhere, from a run's log, against the truth in the run's folder.
 
-    Objects as BOP's results (scene_id,im_id,obj_id,score,R,t,time: im_id counts the images from 0, or is the stamp in
-    nanoseconds; obj_id numbers the scene's models in alphabetical order from 1; T_camera_object), or the robot's pose
-    as a TUM trajectory (stamp in seconds, T_map_base). The metrics have the names of metrics.json.
+    Objects as BOP's results (scene_id,im_id,obj_id,score,R,t,time: scene_id is 1; im_id counts the images from 0, or is
+    the stamp in nanoseconds; obj_id numbers the scene's models in alphabetical order from 1; T_camera_object), or the
+    robot's pose as a TUM trajectory (stamp in seconds, T_map_base). The metrics have the names of metrics.json.
 
     Args:
         run: Folder of `simtrack run`.

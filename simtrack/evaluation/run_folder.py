@@ -48,6 +48,8 @@ CHANGES = (
     "class", "kind", *(f"{when}_{c}" for when in ("before", "after") for c in "xyz"), "noticeable_ns", "noticed_ns",
 )  # fmt: skip
 BOP = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
+SCENE_ID = 1
+"""BOP's number of the one scene of a run."""
 
 
 class RunFolder:
@@ -185,7 +187,7 @@ class TruthTables(_Tables):
         assert frame.track is not None
         T, score = frame.track.T_camera_object, f"{frame.track.score:.6f}"
         R, t = (" ".join(f"{v:.8f}" for v in values) for values in (T[:3, :3].ravel(), 1000 * T[:3, 3]))
-        return 1, image, self._object_ids[frame.class_name], score, R, t, -1
+        return SCENE_ID, image, self._object_ids[frame.class_name], score, R, t, -1
 
 
 class SensorTables(_Tables):

@@ -6,7 +6,7 @@ The metrics are those of `simtrack.evaluation.tracking` and `simtrack.evaluation
 such a file does not tell has no value and says why.
 """
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +19,13 @@ from simtrack.evaluation.evaluator import pose_scorers
 from simtrack.evaluation.metrics import Metrics, measured, ratio, unmeasured
 from simtrack.evaluation.result_files import (
     BOP_HEADER,
+    LeftOut,
     PoseRow,
     StampedPose,
     read_bop,
     read_tum,
 )
+from simtrack.evaluation.run_folder import SCENE_ID
 from simtrack.evaluation.run_truth import RunTruth, TrueObject, read_truth
 from simtrack.evaluation.tracking import TrackingEvaluator
 from simtrack.evaluation.trajectory import SETTLED, TrajectoryEvaluator, absolute_errors
@@ -89,39 +91,16 @@ def score(run: Path, results: Path) -> Score:
 
 
 def _score_objects(truth: RunTruth, path: Path) -> Score:
-    rows, findings = read_bop(path)
-    numbers = {stamp: image for image, stamp in enumerate(truth.stamps)}
-    ids = {number: name for name, number in truth.object_ids.items()}
-    strange, images, objects = Counter[str](), Counter[int](), Counter[int]()
-    by_image: defaultdict[int, list[PoseRow]] = defaultdict(list)
-    seen: set[tuple[object, ...]] = set()
-    for row in rows:
-        # Who works from the log may number images by their stamps.
-        image = row.image if row.image < len(truth.stamps) else numbers.get(row.image, -1)
-        key = (image, row.object_id, row.T_camera_object.tobytes())
-        if not 0 <= image < len(truth.stamps):
-            images[row.image] += 1
-        elif row.object_id not in ids:
-            objects[row.object_id] += 1
-        elif key in seen:
-            strange["duplicate"] += 1
-        else:
-            seen.add(key)
-            by_image[image].append(row)
-    if images:
-        allowed = f"0 to {len(truth.stamps) - 1}, or the stamps in nanoseconds"
-        findings.append(f"{sum(images.values())} rows of unknown images ({_few(images)}) left out; im_id: {allowed}")
-    if objects:
-        known = ", ".join(f"{number} {name}" for number, name in sorted(ids.items()))
-        findings.append(f"{sum(objects.values())} rows of unknown objects ({_few(objects)}) left out; obj_id: {known}")
-    if strange["duplicate"]:
-        findings.append(f"{strange['duplicate']} duplicate rows left out")
+    rows, left_out = read_bop(path)
+    by_image = _by_image(rows, truth, left_out)
+    findings = left_out.findings()
     kept = [row for group in by_image.values() for row in group]
     if not kept:
         raise FileFormatError(path, "rows", "; ".join(["no row can be scored", *findings]))
     unit, said = _unit(kept, truth, path)
     findings.append(said)
     answered = len(by_image)
+    ids = {number: name for name, number in truth.object_ids.items()}
     evaluator = TrackingEvaluator(pose_scorers({name: load_object(name) for name in truth.scored_classes}))
     for image, stamp in enumerate(truth.stamps):
         tracks = [_as_track(row, unit, ids, stamp, n) for n, row in enumerate(by_image.get(image, ()), start=1)]
@@ -130,10 +109,36 @@ def _score_objects(truth: RunTruth, path: Path) -> Score:
     metrics = evaluator.metrics() | {name: unmeasured(*why) for name, why in UNTOLD.items()}
     matched = sum(frame.track is not None for frame in evaluator.frames)
     metrics["score.rows"] = measured(len(kept), "1")
-    metrics["score.rows_left_out"] = measured(len(rows) - len(kept), "1")
+    metrics["score.rows_left_out"] = measured(left_out.count, "1")
     metrics["score.rows_matched_share"] = ratio(matched, len(kept), "no row")
     metrics["score.images_with_results"] = ratio(answered, len(truth.stamps), "no image")
     return Score("BOP", metrics, tuple(findings))
+
+
+def _by_image(rows: Sequence[PoseRow], truth: RunTruth, left_out: LeftOut) -> dict[int, list[PoseRow]]:
+    """Rows that can be scored, by the number of their image; others are added to those left out."""
+    numbers = {stamp: image for image, stamp in enumerate(truth.stamps)}
+    known = {number: name for name, number in truth.object_ids.items()}
+    images = f"im_id is that of no image; allowed: 0 to {len(truth.stamps) - 1}, or the stamps in nanoseconds"
+    objects = "obj_id is that of no object; allowed: " + ", ".join(f"{n} {name}" for n, name in sorted(known.items()))
+    by_image: defaultdict[int, list[PoseRow]] = defaultdict(list)
+    seen: set[tuple[int, int, bytes]] = set()
+    for row in rows:
+        # Who works from the log may number images by their stamps.
+        image = row.image if row.image < len(truth.stamps) else numbers.get(row.image, -1)
+        key = (image, row.object_id, row.T_camera_object.tobytes())
+        if row.scene != SCENE_ID:
+            left_out.add(f"scene_id is that of no scene of the run; allowed: {SCENE_ID}", row.line)
+        elif not 0 <= image < len(truth.stamps):
+            left_out.add(images, row.line)
+        elif row.object_id not in known:
+            left_out.add(objects, row.line)
+        elif key in seen:
+            left_out.add("the same pose of the same object in the same image again", row.line)
+        else:
+            seen.add(key)
+            by_image[image].append(row)
+    return by_image
 
 
 def _unit(rows: Sequence[PoseRow], truth: RunTruth, path: Path) -> tuple[float, str]:
@@ -177,24 +182,20 @@ def _as_truth(stamp: int, things: Sequence[TrueObject]) -> Truth:
 
 
 def _score_trajectory(truth: RunTruth, path: Path) -> Score:
-    poses, findings = read_tum(path)
+    poses, left_out = read_tum(path)
     stamps = np.array(truth.stamps, dtype=np.int64)
+    far = f"no image within {NEAR / 1e6:g} ms; the run's are at {stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s"
     matched: dict[int, StampedPose] = {}
-    strangers = 0
     for pose in poses:
-        nearest = int(np.argmin(np.abs(stamps - pose.stamp)))
-        if abs(int(stamps[nearest]) - pose.stamp) > NEAR:
-            strangers += 1
+        offsets = np.abs(stamps - float(pose.stamp))  # in whatever unit the stamps are: too large for integers
+        nearest = int(np.argmin(offsets))
+        if offsets[nearest] > NEAR:
+            left_out.add(far, pose.line)
+        elif nearest in matched:
+            left_out.add("their image has a pose already", pose.line)
         else:
-            matched.setdefault(nearest, pose)
-    duplicates = len(poses) - strangers - len(matched)
-    span = f"{stamps[0] / 1e9:.3f} to {stamps[-1] / 1e9:.3f} s"
-    if strangers:
-        findings.append(
-            f"{strangers} poses without an image within {NEAR / 1e6:g} ms left out; the run's are at {span}"
-        )
-    if duplicates:
-        findings.append(f"{duplicates} further poses of images that have one already left out")
+            matched[nearest] = pose
+    findings = [*left_out.findings("pose"), *_other_units(poses, stamps)]
     if not matched:
         raise FileFormatError(path, "rows", "; ".join(["no pose can be scored", *findings]))
     chosen = sorted(matched)
@@ -213,8 +214,17 @@ def _score_trajectory(truth: RunTruth, path: Path) -> Score:
     metrics["localization.trusted_share"] = unmeasured("1", "TUM's format says nothing of status")
     metrics["localization.coverage"] = ratio(len(chosen), len(stamps), "no image")
     metrics["score.rows"] = measured(len(chosen), "1")
-    metrics["score.rows_left_out"] = measured(strangers + duplicates, "1")
+    metrics["score.rows_left_out"] = measured(left_out.count, "1")
     return Score("TUM", metrics, tuple(findings))
+
+
+def _other_units(poses: Sequence[StampedPose], stamps: np.ndarray) -> list[str]:
+    """A finding if the stamps are far from the run's, and near them if they are taken for another unit than seconds."""
+    given = float(np.median([pose.stamp for pose in poses])) if poses else 0.0
+    for name, factor in (("nanoseconds", 1e-9), ("microseconds", 1e-6), ("milliseconds", 1e-3)):
+        if given > 2.0 * stamps[-1] and 0.5 * stamps[0] <= factor * given <= 2.0 * stamps[-1]:
+            return [f"stamps look like {name}; TUM's are seconds"]
+    return []
 
 
 def _trajectory_unit(estimated: Sequence[Float64], true: Sequence[Float64]) -> float:
@@ -240,9 +250,3 @@ def _swapped_quaternions(poses: Sequence[StampedPose], true: Sequence[Float64]) 
         told = f"{np.degrees(as_read):.1f} deg from the truth (median), {np.degrees(swapped):.1f} deg in that order"
         return [f"the quaternions look like qw qx qy qz; TUM's order is qx qy qz qw: {told}"]
     return []
-
-
-def _few(counter: Counter[int]) -> str:
-    """The first few numbers of those that were counted."""
-    some = ", ".join(str(number) for number in sorted(counter)[:5])
-    return some + (", ..." if len(counter) > 5 else "")

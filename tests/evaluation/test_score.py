@@ -144,21 +144,25 @@ def test_rows_that_cannot_be_used_are_told(run: Run, tmp_path: Path) -> None:
     bad = [
         {**first, "im_id": "77"}, {**first, "obj_id": "9"}, dict(first), {**first, "R": "1 0 0"},
         {**first, "R": mirrored}, {**first, "t": "nan 0 0"}, {**first, "im_id": "one"}, {**first, "t": "a b c"},
+        {**first, "scene_id": "7"}, {**first, "scene_id": "7"},
     ]  # fmt: skip
     found = score(run.folder, write(tmp_path / "r.csv", rows + bad))
     assert_same(found, run, "tracking.")
     told = "\n".join(found.findings)
     for text in (
-        "1 rows of unknown images (77) left out; im_id: 0 to 5",
-        "1 rows of unknown objects (9) left out; obj_id: 1 mug, 2 relay, 3 screwdriver",
-        "1 duplicate rows left out",
+        "1 row left out: im_id is that of no image; allowed: 0 to 5, or the stamps in nanoseconds (line 13)",
+        "1 row left out: obj_id is that of no object; allowed: 1 mug, 2 relay, 3 screwdriver (line 14)",
+        "1 row left out: the same pose of the same object in the same image again (line 15)",
         "R does not have 9 numbers (line 16)",
         "R is no rotation (line 17)",
         "t is not finite (line 18)",
-        "im_id or obj_id is no integer (line 19)",
+        "scene_id, im_id or obj_id is no integer (line 19)",
         "t holds something else than numbers (line 20)",
+        "2 rows left out: scene_id is that of no scene of the run; allowed: 1 (line 21, 22)",
     ):
         assert text in told, text
+    assert found.metrics["score.rows"].value == len(rows)
+    assert found.metrics["score.rows_left_out"].value == len(bad)
 
 
 def scaled(run: Run, path: Path) -> Path:
@@ -175,6 +179,10 @@ UNUSABLE: dict[str, tuple[Callable[[Run, Path], Path], str]] = {
     "table": (lambda run, path: write(path, [{"a": "1", "b": "2"}]), "expected the header scene_id,im_id"),
     "missing": (lambda run, path: path, "cannot be read"),
     "other times": (lambda run, path: tum(path, [(10**12, np.eye(4))]), "the run's are at 0.533 to 0.700 s"),
+    "nanoseconds": (
+        lambda run, path: tum(path, [(10**9 * stamp, T) for stamp, T in run.estimated]),
+        "stamps look like nanoseconds; TUM's are seconds",
+    ),
     "no lines": (lambda run, path: tum(path, []), "no pose can be scored"),
 }
 
@@ -210,10 +218,15 @@ def test_trajectories_with_strange_poses_are_told(run: Run, tmp_path: Path) -> N
     found = score(run.folder, path)
     assert found.metrics["localization.coverage"].value == pytest.approx(5 / 6)
     told = "\n".join(found.findings)
-    assert "1 poses without an image" in told
-    assert "1 further poses" in told
-    assert "does not have 8 numbers" in told
-    assert "not of length 1" in told
+    for text in (
+        "1 pose left out: no image within 5 ms; the run's are at 0.533 to 0.700 s (line 8)",
+        "1 pose left out: their image has a pose already (line 7)",
+        "the line does not have 8 numbers (line 9)",
+        "the quaternion is not of length 1 (line 10)",
+    ):
+        assert text in told, text
+    assert found.metrics["score.rows"].value == 5
+    assert found.metrics["score.rows_left_out"].value == 4
 
 
 def test_swapped_quaternions_and_millimetres_are_told(run: Run, tmp_path: Path) -> None:
