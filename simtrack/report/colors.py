@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 
-PALETTE = ("#4c9be8", "#f28e2b", "#59b36b", "#e0567a", "#b07aa1", "#17b3b3", "#d6a514", "#9c755f", "#7f8cff", "#8fb339")
-"""Tableau-like hues of about equal lightness."""
+PALETTE = ("#4c9be8", "#acaf15", "#c23b80", "#0d8164", "#946945", "#de94a2", "#ec9500", "#1abbbf", "#706d9f", "#c990fc")
+"""Each differs from the others by 22 at least (CIEDE2000); legible on light and dark ground."""
 SHADES = (("#000000", 0.0), ("#000000", 0.38), ("#ffffff", 0.5))
 """What the hues are mixed with, and its share, once they are used up."""
 ON, LEFT_OF, REFERENCE = "#ff3b30", "#20d5e8", "#ffd60a"

@@ -4,6 +4,7 @@ Each figure is drawn twice, for wide and for narrow pages, with type of the same
 """
 
 import io
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
 
 WIDE, HALF, NARROW = 11.0, 5.5, 4.2
 """Inches: the page's whole width, half of it, and a telephone's."""
+ERROR_SPAN = 0.1, 150.0
+"""Millimetres: what the axis of objects' errors shows at least."""
+MOST_SHOWN = 10_000.0
+"""Millimetres: larger errors of objects are drawn as this."""
 MAX_SAMPLES = 400
 """Points of a curve in the page."""
 _STYLE: dict[Any, Any] = {
@@ -167,11 +172,13 @@ def object_errors(record: RunRecord, colors: Mapping[str, str]) -> str:
     series: dict[str, list[ObjectFrame]] = {}
     for frame in record.object_frames:
         series.setdefault(frame.name, []).append(frame)
+    largest = max((1e3 * f.translation_error for f in record.object_frames if f.track is not None), default=0.0)
+    top = min(max(ERROR_SPAN[1], 1.5 * largest), MOST_SHOWN)
 
     def draw(figure: "Figure", width: float) -> None:
         rows = figure.subplots(len(series), 1, sharex=True, squeeze=False)[:, 0]
         for axes, (name, frames) in zip(rows, series.items(), strict=True):
-            _object_row(axes, record, name, frames, colors[frames[0].class_name])
+            _object_row(axes, record, name, frames, colors[frames[0].class_name], top)
             for stamp, switched in record.switches:
                 if switched == name:
                     axes.axvline(_seconds(record, stamp), color=BAD, linewidth=1.2, linestyle=":")
@@ -179,11 +186,14 @@ def object_errors(record: RunRecord, colors: Mapping[str, str]) -> str:
         rows[-1].margins(x=0.01)
         figure.supylabel("translation error in mm", fontsize=8.5, color=MUTED)
 
-    height = 0.62 * len(series) + 0.5
+    decades = math.log10(top / ERROR_SPAN[0])
+    height = (0.26 + 0.12 * decades) * len(series) + 0.5
     return both_widths(draw, (height, height * 1.1), "error over time of every object") if series else ""
 
 
-def _object_row(axes: "Axes", record: RunRecord, name: str, frames: Sequence[ObjectFrame], color: str) -> None:
+def _object_row(
+    axes: "Axes", record: RunRecord, name: str, frames: Sequence[ObjectFrame], color: str, top: float
+) -> None:
     seconds = _seconds(record, np.array([f.stamp for f in frames]))
     seen = np.array([f.scored for f in frames])
     tracked = np.array([f.track is not None for f in frames])
@@ -194,11 +204,13 @@ def _object_row(axes: "Axes", record: RunRecord, name: str, frames: Sequence[Obj
             axes.axvspan(
                 seconds[start], seconds[min(end, len(seconds) - 1)], color=shade, alpha=alpha, linewidth=0, zorder=z
             )
-    axes.plot(*_thin(seconds, np.where(seen, np.nan, errors)), color=color, linewidth=0.8, alpha=0.55)
-    axes.plot(*_thin(seconds, np.where(seen, errors, np.nan)), color=color)
+    shown = np.clip(errors, ERROR_SPAN[0], MOST_SHOWN)
+    _curve(axes, *_thin(seconds, np.where(seen, np.nan, shown)), color=color, linewidth=0.8, alpha=0.55)
+    _curve(axes, *_thin(seconds, np.where(seen, shown, np.nan)), color=color)
     axes.set_yscale("log")
-    axes.set_ylim(0.1, 150)
-    axes.set_yticks([0.1, 1, 10, 100], ["0.1", "1", "10", ""], minor=False)
+    axes.set_ylim(ERROR_SPAN[0], top)
+    ticks = [value for value in (0.1, 1, 10, 100, 1000, 10_000) if value <= top]
+    axes.set_yticks(ticks, [f"{value:g}" for value in ticks], minor=False)
     axes.minorticks_off()
     axes.grid(True, axis="y")
     median = np.median(errors[seen & tracked]) if (seen & tracked).any() else np.nan
@@ -270,12 +282,13 @@ def stage_times(record: RunRecord) -> str:
             median, high = np.median(stages[name]), np.quantile(stages[name], 0.95)
             axes.barh(k, median, height=0.62, color=ACCENT, linewidth=0)
             axes.plot([median, high], [k, k], color=MUTED, linewidth=1.4)
-            axes.annotate(f" {median:.1f} ms", (high, k), va="center", fontsize=8, color=INK)
+            text = f"{median:.1f} (p95 {high:.1f}) ms"
+            axes.annotate(text, (high, k), (4, 0), textcoords="offset points", va="center", fontsize=8, color=INK)
         axes.set_yticks(range(len(names)), names, color=INK)
         axes.set_ylim(len(names) - 0.4, -0.6)
-        axes.margins(x=0.14)
+        axes.margins(x=1.6 / width)  # room for the numbers
         axes.tick_params(axis="y", length=0)
-        axes.set_xlabel("time in ms: bar to the median, line to the 95th percentile")
+        axes.set_xlabel("time in ms: bar and first number: median; line: to the 95th percentile")
         axes.grid(True, axis="x")
 
     height = 0.26 * len(names) + 0.6
@@ -287,6 +300,15 @@ def stage_times(record: RunRecord) -> str:
 
 def _seconds(record: RunRecord, stamps: np.ndarray | int) -> np.ndarray:
     return (np.asarray(stamps) - record.start) / NANOSECONDS
+
+
+def _curve(axes: "Axes", x: Float64, y: Float64, **style: Any) -> None:
+    """Plot a curve with gaps (NaN); what has a gap on either side, and would be no line, is a point."""
+    axes.plot(x, y, **style)
+    known = np.concatenate([[False], np.isfinite(y), [False]])
+    alone = known[1:-1] & ~known[:-2] & ~known[2:]
+    if alone.any():
+        axes.plot(x[alone], y[alone], linestyle="", marker="o", markersize=3.5, markeredgewidth=0, **style)
 
 
 def _thin(x: Float64, y: Float64) -> tuple[Float64, Float64]:

@@ -14,6 +14,7 @@ from simtrack.evaluation.record import Interval, RunRecord
 from simtrack.evaluation.targets import Target
 from simtrack.geometry.meshes import box_mesh
 from simtrack.geometry.transforms import transform
+from simtrack.report.figures import object_errors, stage_times
 from simtrack.report.headline import format_metric, table
 from simtrack.report.overlay import box_layer, silhouette
 from simtrack.report.page import choose_relations, render, write_report
@@ -126,3 +127,22 @@ def test_relations_that_changed_come_first() -> None:
     changed = Interval(Relation("b", "near", "c"), 2, 5)
     support = Interval(Relation("a", "on", "b"), 0, 10)
     assert choose_relations([constant, changed, support]) == [support, changed, constant]
+
+
+def test_large_errors_and_single_frames_are_drawn(record: RunRecord) -> None:
+    first = [frame for frame in record.object_frames if frame.name == "materialbox"]
+    lone = replace(first[30], translation_error=2.4)
+    kept = [replace(f, track=None) if f is first[29] or f is first[31] else f for f in first]
+    colors = {"materialbox": "#4c9be8"}
+    usual = object_errors(replace(record, object_frames=first), colors)
+    figure = object_errors(replace(record, object_frames=[lone if f is first[30] else f for f in kept]), colors)
+    assert {label for label in ("0.1", "1", "10", "100", "1000") if f">{label}<" in usual} == {"0.1", "1", "10", "100"}
+    assert ">1000<" in figure
+    # matplotlib draws markers as <use>; the axes have one a tick
+    points = [re.findall(r"<use [^>]*#4c9be8", text) for text in (usual, figure)]
+    assert [len(found) for found in points] == [0, 2], "one in each width"
+
+
+def test_times_of_stages_tell_median_and_percentile(record: RunRecord) -> None:
+    times = {"tracking": [0.010] * 90 + [0.030] * 10}
+    assert "10.0 (p95 30.0) ms" in stage_times(replace(record, stage_seconds=times))
