@@ -14,9 +14,9 @@ def debug(
 ) -> int:
     """Do the tracker's registration of one frame again, exactly, and show what it was given and what it made of it.
 
-    A run keeps its ten worst frames: those with the largest error of an object that should be tracked. The picture has
-    the depth image with outlines of truth, prediction and registration, the detections that came in, and what is left
-    between measured and registered surface. Without --frame the kept frames are listed.
+    A run keeps up to ten frames, its worst: those with the largest error of an object that should be tracked. The
+    picture has the depth image with outlines of truth, prediction and registration, the detections that came in, and
+    what is left between measured and registered surface. Without --frame the kept frames are listed.
 
     Args:
         run: Folder of `simtrack run`.
@@ -26,13 +26,14 @@ def debug(
     """
     from simtrack.cli import console
     from simtrack.evaluation.instrument.examination import examine
-    from simtrack.evaluation.instrument.moments import FOLDER, read_moment, stored_frames
+    from simtrack.evaluation.instrument.moments import FOLDER, kept_frames, read_moment
     from simtrack.evaluation.instrument.rebuilding import rebuilt_models
     from simtrack.perception.stack_config import StackConfig
     from simtrack.report.moment_page import COLUMNS, rows, told_error, write_picture
 
+    frames = kept_frames(run)
     if frame is None:
-        kept = [read_moment(run, number) for number in stored_frames(run)]
+        kept = [read_moment(run, number) for number in frames]
         lines = [(m.frame, f"{m.stamp / 1e9:.2f} s", m.worst, told_error(m)) for m in kept]
         console.show_table(("frame", "time", "object", "error"), lines, right=(0, 1))
         return 0
@@ -46,11 +47,10 @@ def debug(
         console.show_error(f"not the same as in the run: poses differ by up to {found.largest_change:.3g} m or rad")
     picture = out if out is not None else run / FOLDER / f"{frame}.png"
     write_picture(found, picture)
-    written = [picture.name]
+    console.show_written(picture.parent, [picture.name])
     if rrd is not None:
         from simtrack.report.rerun_log import log_examination
 
         log_examination(found, models, rrd)
-        written.append(str(rrd))
-    console.show_written(picture.parent, written)
+        console.show_written(rrd.parent, [rrd.name])
     return 0 if found.largest_change == 0.0 else 1

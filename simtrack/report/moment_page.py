@@ -1,5 +1,6 @@
 """A picture of one frame done again: depth with outlines, residuals of the registered models, a table of objects."""
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from simtrack.contracts import NANOSECONDS, Float64
 from simtrack.errors import InvalidValueError
 from simtrack.evaluation.instrument.examination import Examination, ObjectExamination
 from simtrack.evaluation.instrument.moments import StoredMoment
+from simtrack.evaluation.tracking import GATE
 
 LEAST_SHOWN = 0.005
 """Metres at which the colours of residuals end at least."""
@@ -21,6 +23,18 @@ def told_error(moment: StoredMoment) -> str:
     """What is wrong at a moment."""
     untracked = any(o.name == moment.worst and o.track is None for o in moment.objects)
     return "is not tracked" if untracked else f"is off by {1e3 * moment.error:.1f} mm"
+
+
+def caption(moment: StoredMoment) -> str:
+    """Whose outlines and residuals are drawn beside those of tracked objects; empty if nobody's."""
+    owned = {o.track for o in moment.objects}
+    others = [f"{track} ({name})" for track, name in sorted(moment.classes.items()) if track not in owned]
+    if not others:
+        return ""
+    return (
+        f"Outlines and residuals also of tracks that are no object's: {', '.join(others)}. "
+        f"They are tentative, or no object of their class is within {100 * GATE:.0f} cm."
+    )
 
 
 def rows(found: Examination) -> list[tuple[str, ...]]:
@@ -91,6 +105,8 @@ def write_picture(found: Examination, path: Path) -> None:
     handles = [Line2D([], [], color=color, label=f"{name} outline") for name, color in OUTLINES.items()]
     handles.append(Line2D([], [], color="#e0567a", marker="x", linestyle="", label="detection that came in"))
     panels[1, 0].legend(handles=handles, loc="upper left", frameon=False, fontsize=9)
+    said = panels[1, 0].text(0.01, 0.4, textwrap.fill(caption(moment), 50), fontsize=9, va="top")
+    said.set_in_layout(False)
     grid = panels[1, 1].table(cellText=rows(found)[:8], colLabels=COLUMNS, loc="upper center", cellLoc="left")
     grid.auto_set_font_size(False)
     grid.set_fontsize(7.5)

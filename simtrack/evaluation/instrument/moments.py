@@ -80,9 +80,10 @@ class MomentKeeper:
         self.moments = sorted([*kept, found], key=lambda m: -m.error)[:KEPT]
 
     def save(self, folder: Path) -> None:
-        """Write ``moments/FRAME.npz``; older files there go."""
+        """Write ``moments/FRAME.npz``; older files there go. Without moments no folder is made."""
         place = folder / FOLDER
-        place.mkdir(exist_ok=True)
+        if self.moments:
+            place.mkdir(exist_ok=True)
         names = {f"{moment.frame}.npz" for moment in self.moments}
         for old in place.glob("*.npz"):
             if old.name not in names:
@@ -151,6 +152,32 @@ class StoredMoment:
 def stored_frames(run: Path) -> list[int]:
     """Numbers of the frames whose moments a run's folder has."""
     return sorted(int(path.stem) for path in (run / FOLDER).glob("*.npz") if path.stem.isdecimal())
+
+
+def kept_frames(run: Path) -> list[int]:
+    """Numbers of the frames whose moments the folder of a run has, at least one.
+
+    Raises:
+        FileFormatError: it is not the folder of a run, or the run kept none.
+    """
+    import yaml
+
+    file = run / "config.yaml"
+    try:
+        config = yaml.safe_load(file.read_text(encoding="utf-8"))
+        scene, tracker = str(config["scene"]), config.get("tracker")
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        raise FileFormatError(run, "", "no such run; expected the folder of a `simtrack run`") from error
+    if tracker:
+        reason = f"only simtrack's own tracker keeps moments; the tracker of this run was '{tracker}'"
+        raise FileFormatError(run, "tracker", reason)
+    frames = stored_frames(run)
+    if not frames:
+        reason = (
+            f"this run of {scene} kept no moment: none of the objects to be tracked was in view after the first second"
+        )
+        raise FileFormatError(run / FOLDER, "", reason)
+    return frames
 
 
 def read_moment(run: Path, frame: int) -> StoredMoment:

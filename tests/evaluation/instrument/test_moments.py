@@ -9,7 +9,7 @@ import pytest
 from simtrack.contracts import NANOSECONDS, CameraIntrinsics, PoseHypothesis, Track, TrackStatus
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.evaluation.instrument.examination import examine
-from simtrack.evaluation.instrument.moments import KEPT, MomentKeeper, read_moment, stored_frames
+from simtrack.evaluation.instrument.moments import KEPT, MomentKeeper, kept_frames, read_moment, stored_frames
 from simtrack.evaluation.tracking import ObjectFrame
 from simtrack.geometry.transforms import perturb, rotation_from_rpy, transform
 from simtrack.objects import load_object
@@ -18,7 +18,8 @@ from simtrack.perception.tracking.registration_config import RegistrationConfig
 from simtrack.perception.tracking.target import tracked_model
 from simtrack.perception.tracking.trace import RegistrationTrace
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
-from simtrack.report.moment_page import rows, write_picture
+from simtrack.report.moment_page import caption, rows, told_error, write_picture
+from tests.cli.commands import simtrack_command
 
 K = CameraIntrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
 TRUE = transform(rotation_from_rpy(0.4, -0.3, 0.5), (0.02, -0.01, 0.6))
@@ -64,6 +65,9 @@ def test_a_moment_done_again_is_the_same_and_near_the_truth(trace: RegistrationT
     assert thing.registered[0] < 0.1 * thing.predicted[0]
     assert np.nanmedian(np.abs(found.residuals)) < 5e-4
     assert found.outlines["true"].any() and rows(found)[0][0] == "relay"
+    assert caption(moment) == ""
+    untracked = replace(moment, objects=tuple(replace(o, track=None) for o in moment.objects))
+    assert "no object's: 4 (relay)" in caption(untracked) and told_error(untracked) == "is not tracked"
     write_picture(found, tmp_path / "60.png")
     assert (tmp_path / "60.png").stat().st_size > 10_000
     other = examine(moment, MODELS, replace(RegistrationConfig(), inner_iterations=1))
@@ -95,6 +99,18 @@ def test_what_was_not_kept_or_cannot_be_read_is_told(trace: RegistrationTrace, t
         read_moment(tmp_path, 61)
     with pytest.raises(InvalidValueError, match="classes"):
         examine(read_moment(tmp_path, 60), {}, RegistrationConfig())
+    for config, message in ((None, "no such run"), ("scene: a\ntracker: b:C\n", "only simtrack's own tracker keeps"),
+                            ("scene: a\n", "kept no moment")):  # fmt: skip
+        folder = tmp_path / message.replace(" ", "-")
+        if config is not None:
+            folder.mkdir()
+            (folder / "config.yaml").write_text(config)
+            MomentKeeper().save(folder)
+            assert not (folder / "moments").exists()
+        done = simtrack_command("debug", folder)
+        assert done.returncode == 2 and message in done.stderr
+    (tmp_path / "config.yaml").write_text("scene: a\ntracker: null\n")
+    assert kept_frames(tmp_path) == [60]
     (tmp_path / "moments" / "60.npz").write_bytes(b"nonsense")
     with pytest.raises(FileFormatError):
         read_moment(tmp_path, 60)
