@@ -50,6 +50,14 @@ class InvalidValueError(SimtrackError, ValueError):
         super().__init__(f"{name} = {value!r} is not valid; allowed: {allowed}")
 
 
+class MissingValueError(SimtrackError, ValueError):
+    """An argument that was not given and has no default."""
+
+    def __init__(self, name: str, wanted: str) -> None:
+        self.name, self.wanted = name, wanted
+        super().__init__(f"{name} is required: {wanted}")
+
+
 class RaycastError(SimtrackError):
     """Embree refused a call or could not be loaded."""
 

@@ -117,7 +117,13 @@ def write_comparison(found: Comparison, first: Sequence[str], folder: Path) -> l
     sections = [
         Section("Headline", "", "", columns, table(headline=True)),
         Section("All metrics", "", "", columns, table(headline=False)),
-        Section("Runs", "", "", ("method", "scene:seed"), [(m, ", ".join(s)) for m, s in found.seeds.items()]),
+        Section(
+            "Runs",
+            " ".join(f"{remark[0].upper()}{remark[1:]}." for remark in found.remarks),
+            "",
+            ("method", "scene:seed"),
+            [(m, ", ".join(s)) for m, s in found.seeds.items()],
+        ),
     ]
     lead = (
         "Medians over runs with 95 % bootstrap intervals. + marks what is significantly better than "

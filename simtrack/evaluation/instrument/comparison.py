@@ -1,11 +1,12 @@
 """Methods beside each other: runs grouped by what ran in them, paired by scene and seed."""
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from simtrack.errors import FileFormatError, InvalidValueError
-from simtrack.evaluation.instrument.statistics import Difference, Estimate, difference, estimate
+from simtrack.evaluation.instrument.statistics import LEAST_PAIRS, Difference, Estimate, difference, estimate
 from simtrack.evaluation.metrics import Metrics, read_metrics
 from simtrack.evaluation.run_config import ORACLE
 
@@ -39,6 +40,8 @@ class Run:
     seed: int
     method: str
     """Its stages that are not simtrack's own, or ``simtrack``."""
+    duration: float | None
+    """Simulated seconds; None where the folder does not tell."""
     metrics: Metrics
 
 
@@ -54,6 +57,7 @@ def read_run(path: Path) -> Run:
     try:
         config = yaml.safe_load(file.read_text(encoding="utf-8"))
         scene, seed = str(config["scene"]), int(config["seed"])
+        duration = float(config["duration"]) if config.get("duration") is not None else None
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
         raise FileFormatError(file, "", "not the folder of a run: no scene and seed in config.yaml") from error
     metrics = read_metrics(path / "metrics.json")
@@ -62,7 +66,7 @@ def read_run(path: Path) -> Run:
         raise FileFormatError(path / "metrics.json", "run.partial", "the run was stopped before its end")
     foreign = [str(config[stage]) for stage in STAGES if config.get(stage)]
     foreign += [str(config["detector"])] if config.get("detector", ORACLE) != ORACLE else []
-    return Run(path, scene, seed, " + ".join(foreign) or "simtrack", metrics)
+    return Run(path, scene, seed, " + ".join(foreign) or "simtrack", duration, metrics)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +98,8 @@ class Comparison:
     seeds: Mapping[str, tuple[str, ...]]
     """Method -> scenes with their seeds."""
     rows: tuple[Row, ...]
+    remarks: tuple[str, ...]
+    """What is to be known of the comparison, a sentence each: unequal durations, too few pairs."""
 
 
 def compare(runs: Sequence[Run], metrics: Sequence[str] | None = None) -> Comparison:
@@ -130,7 +136,34 @@ def compare(runs: Sequence[Run], metrics: Sequence[str] | None = None) -> Compar
         if any(cell.estimate is not None for cell in cells):
             rows.append(Row(name, unit, cells))
     seeds = {method: tuple(f"{scene}:{seed}" for scene, seed in of) for method, of in by_method.items()}
-    return Comparison(tuple(by_method), seeds, tuple(rows))
+    remarks = [*_unequal(runs), *_too_few(by_method)]
+    return Comparison(tuple(by_method), seeds, tuple(rows), tuple(remarks))
+
+
+def _unequal(runs: Sequence[Run]) -> list[str]:
+    """A remark on each scene whose runs took different times: what they measure is not of the same events."""
+    durations: defaultdict[str, set[float]] = defaultdict(set)
+    for run in runs:
+        if run.duration is not None:
+            durations[run.scene].add(run.duration)
+    return [
+        f"runs of {scene} are of different duration ({', '.join(f'{d:g}' for d in sorted(found))} s): "
+        "differences between them are also those of what happened meanwhile"
+        for scene, found in durations.items()
+        if len(found) > 1
+    ]
+
+
+def _too_few(by_method: Mapping[str, Mapping[tuple[str, int], Run]]) -> list[str]:
+    """A remark on each method whose difference to the first cannot be significant."""
+    first, *others = by_method
+    pairs = {method: len(by_method[method].keys() & by_method[first].keys()) for method in others}
+    return [
+        f"nothing can be significant between {method} and {first}: "
+        f"{count} pair{'' if count == 1 else 's'} of scene and seed, {LEAST_PAIRS} are needed"
+        for method, count in pairs.items()
+        if count < LEAST_PAIRS
+    ]
 
 
 def _values(runs: Mapping[tuple[str, int], Run], name: str) -> dict[tuple[str, int], float]:

@@ -16,6 +16,7 @@ from simtrack.evaluation.instrument.statistics import difference, estimate
 from simtrack.evaluation.instrument.sweep import Axis, parse_axes, sweep
 from simtrack.evaluation.metrics import Metrics, measured
 from simtrack.report.instrument_pages import write_comparison, write_sweep
+from tests.cli.commands import simtrack_command
 from tests.evaluation.instrument.fakes import FormulaRunner
 
 
@@ -74,9 +75,12 @@ def test_a_difference_is_significant_where_pairs_agree_and_not_where_they_do_not
     assert few is not None and not few.significant
 
 
-def write_run(folder: Path, seed: int, tracker: str | None, recall: float, partial: bool = False) -> Path:
+def write_run(
+    folder: Path, seed: int, tracker: str | None, recall: float, partial: bool = False, duration: float = 10.0
+) -> Path:
     folder.mkdir(parents=True)
-    config = {"scene": "workbench", "seed": seed, "tracker": tracker, "localizer": None, "detector": "oracle"}
+    config = {"scene": "workbench", "seed": seed, "duration": duration, "tracker": tracker, "localizer": None,
+              "detector": "oracle"}  # fmt: skip
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     rows = {
         "tracking.recall": {"value": recall, "unit": "1"},
@@ -100,6 +104,25 @@ def test_methods_are_paired_by_seed_and_better_is_what_the_metric_says(tmp_path:
     assert error.cells[1].better is True and recall.cells[0].difference is None
     write_comparison(found, ["tracking.recall"], tmp_path / "out")
     assert "icp:Tracker" in (tmp_path / "out" / "comparison.html").read_text()
+    assert found.remarks == ()
+
+
+def test_what_weakens_a_comparison_is_told(tmp_path: Path) -> None:
+    own = write_run(tmp_path / "own", 0, None, 0.9)
+    icp = write_run(tmp_path / "icp", 0, "icp:Tracker", 0.7, duration=8.0)
+    done = simtrack_command("compare", own, icp, "--out", tmp_path / "out", "--metrics", "localization.ate_rmse")
+    assert done.returncode == 0, done.stderr
+    for text in (
+        "runs of workbench are of different duration (8, 10 s)",
+        "nothing can be significant between icp:Tracker and simtrack: 1 pair of scene and seed, 5 are needed",
+        "simtrack: 1 run\n",
+    ):
+        assert text in done.stdout
+    assert "Runs of workbench are of different duration" in (tmp_path / "out" / "comparison.html").read_text()
+    unknown = simtrack_command("compare", own, icp, "--out", tmp_path / "out", "--metrics", "tracking.recal")
+    assert unknown.returncode == 2 and "such as tracking.recall" in unknown.stderr
+    nothing = simtrack_command("compare")
+    assert nothing.returncode == 2 and "RUN_DIR is required: folders of `simtrack run`" in nothing.stderr
 
 
 def test_what_is_no_run_or_twice_the_same_is_refused(tmp_path: Path) -> None:
