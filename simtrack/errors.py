@@ -19,10 +19,11 @@ class SimtrackError(Exception):
 class UnknownNameError(SimtrackError):
     """A scene, object, agent, detector or other registered name that does not exist."""
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: str, known: Iterable[str], otherwise: str = "") -> None:
+        """`otherwise`: what would have been valid beside the known names."""
         self.kind, self.name, self.known = kind, name, sorted(known)
         listing = ", ".join(self.known) if self.known else "(none)"
-        super().__init__(f"unknown {kind} '{name}'. Known: {listing}")
+        super().__init__(f"unknown {kind} '{name}'. Known: {listing}{'; ' if otherwise else ''}{otherwise}")
 
 
 class FileFormatError(SimtrackError):

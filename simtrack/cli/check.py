@@ -29,9 +29,12 @@ def check(
         time_limit: Seconds that each engine may take.
     """
     from simtrack.cli import console
+    from simtrack.errors import FileFormatError
     from simtrack.plausibility.check import RESULTS, check_urdf
     from simtrack.plausibility.verdict import CheckConfig
 
+    if not file.is_file():
+        raise FileFormatError(file, "", "no such file; give a URDF file")
     folder = out if out is not None else Path("runs") / f"check-{file.stem or file.resolve().name}"
     with console.ProgressLine(f"check of {file}", "settling in both engines"):
         report = check_urdf(file, root=root, out=folder, config=CheckConfig(duration=duration), time_limit=time_limit)

@@ -63,14 +63,14 @@ def evaluate(
 
 def _detector(data: Path | None, detector: str, count: int | None, out: Path) -> int:
     from simtrack.cli import console
-    from simtrack.errors import InvalidValueError
+    from simtrack.errors import InvalidValueError, MissingValueError
     from simtrack.evaluation.detector import evaluate_detector, write_scores
     from simtrack.perception.detection.keypoint_detector import KeypointDetector
     from simtrack.perception.detection.loading import KEYPOINTS
     from simtrack.training.source import open_source
 
     if data is None:
-        raise InvalidValueError("data", None, "the folder of a generated data set")
+        raise MissingValueError("--data", "the folder of a data set that `simtrack generate` made with the format bop")
     if count is not None and count < 1:
         raise InvalidValueError("count", count, "1 or more")
     source = open_source(data)

@@ -300,7 +300,7 @@ def load_scene(name_or_path: str | Path) -> SceneFile:
     known = scene_names()
     name, colon, seed = str(name_or_path).partition(":")
     if name not in known or (colon and not (seed.isascii() and seed.isdecimal() and len(seed) < 10)):
-        raise UnknownNameError("scene", str(name_or_path), [*known, "NAME:SEED with one of these and a whole number"])
+        raise UnknownNameError("scene", str(name_or_path), known, "or NAME:SEED with one of these and a whole number")
     scene = read_scene(known[name] / FILE_NAME)
     return scene if not colon else with_building_seed(scene, int(seed))
 

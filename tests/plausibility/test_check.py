@@ -235,6 +235,6 @@ def test_the_command_ends_with_the_verdict(tmp_path: Path, capsys: pytest.Captur
     assert main(["check", str(urdf), "--duration", "1", "--out", str(tmp_path / "out")]) == 1
     said = capsys.readouterr().out
     assert "floats" in said and "not plausible" in said
-    assert main(["check", str(tmp_path / "nothing.urdf"), "--out", str(tmp_path / "out")]) == 2
-    assert "no such file" in capsys.readouterr().out
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["check.json"]
+    assert main(["check", str(tmp_path / "nothing.urdf"), "--out", str(tmp_path / "other")]) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
