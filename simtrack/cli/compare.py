@@ -9,7 +9,7 @@ import tyro
 
 
 def compare(
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN_DIR...")],
     metrics: str = "",
     out: Path = Path("runs/comparison"),
 ) -> int:

@@ -7,7 +7,7 @@ import tyro
 
 
 def debug(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_DIR")],
     frame: int | None = None,
     out: Path | None = None,
     rrd: Path | None = None,

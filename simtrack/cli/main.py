@@ -3,6 +3,7 @@
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import simtrack
 from simtrack.cli import console
@@ -26,6 +27,7 @@ from simtrack.cli.score import score
 from simtrack.cli.sweep import sweep
 from simtrack.cli.train import train
 from simtrack.cli.trials import trials
+from simtrack.cli.usage import folded, optional_values, unbroken
 from simtrack.cli.validate import validate
 
 VERBS = {
@@ -66,9 +68,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     warnings.showwarning = console.show_warning
     try:
-        code = tyro.extras.subcommand_cli_from_dict(
-            VERBS, prog="simtrack", description=DESCRIPTION, args=arguments or ["--help"]
-        )
+        with folded() if {"-h", "--help"} & {*arguments} or not arguments else nullcontext():
+            code = tyro.extras.subcommand_cli_from_dict(
+                {verb: unbroken(function) for verb, function in VERBS.items()},
+                prog="simtrack",
+                description=DESCRIPTION,
+                args=arguments or ["--help"],
+                config=(tyro.conf.PositionalMetavarFromFieldName,),
+                registry=optional_values(),
+            )
     except SimtrackError as error:
         console.show_error(str(error))
         return 2

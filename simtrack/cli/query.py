@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 SPARQL = ("select", "ask", "construct", "describe", "prefix", "base")
 
 
-def query(run_dir: Annotated[Path, tyro.conf.Positional], question: Annotated[str, tyro.conf.Positional]) -> int:
+def query(
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_DIR")],
+    question: Annotated[str, tyro.conf.Positional],
+) -> int:
     """Ask the scene graph of a run, e.g. `simtrack query runs/workbench-0 '? left-of multimeter'`.
 
     Args:

@@ -7,7 +7,7 @@ import tyro
 
 
 def score(
-    run: Annotated[Path, tyro.conf.Positional],
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_DIR")],
     results: Annotated[Path, tyro.conf.Positional],
     out: Path | None = None,
 ) -> int:

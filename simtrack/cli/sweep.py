@@ -27,7 +27,8 @@ def sweep(
     """Run a scene over values of conditions, one condition at a time, on several seeds; draw every metric as a curve.
 
     Conditions: noise, model_error, calibration, detection, speed (factors, 1 changes nothing), model_scale and
-    detector_bias (shares), extrinsics (degrees), time_offset and latency (seconds), occlusion (things in the way).
+    detector_bias (shares), extrinsics (degrees), time_offset and latency (seconds), occlusion (things in the way),
+    false_symmetry and lidar_mirrored (1: the models, the lidar are said to be other than they are).
     The same command carries on where a stopped one was; runs are kept by their content.
 
     Args:
@@ -35,7 +36,7 @@ def sweep(
         over: For example noise=0:3,latency=0:0.5:6,occlusion=0;2;4 - LOW:HIGH is walked in five values.
         seeds: Seeds a value; bands are 95 % bootstrap intervals of the median over them.
         seed: The first of them.
-        duration: Simulated seconds; the scene's own if none.
+        duration: Simulated seconds; None: the scene's own.
         given: Conditions that hold everywhere: noise=2,speed=0.5.
         tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
         localizer: A localizer of yours, package.module:Class, or oracle.

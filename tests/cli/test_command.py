@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 import simtrack
+from simtrack.cli.main import VERBS
+from simtrack.cli.usage import unbroken
 from tests.cli.commands import refusal, refused, simtrack_command, simtrack_process
 
 
@@ -29,6 +31,42 @@ def test_every_verb_has_help() -> None:
     assert result.returncode == 0
     for option in ("--duration", "--seed", "--out", "--agent", "--detector", "--renderer", "--overwrite", "--log"):
         assert option in result.stdout
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_fits_the_terminal(verb: str) -> None:
+    told = simtrack_command(verb, "--help", env={"COLUMNS": "72"})
+    assert told.returncode == 0
+    assert max(map(len, told.stdout.splitlines())) <= 72
+    assert "{None" not in told.stdout
+
+
+def test_sentences_of_help_have_no_breaks_and_paragraphs_stay() -> None:
+    def verb() -> int:
+        """Do it.
+
+        A longer story
+        (in two lines).
+
+        Args:
+            one: The first,
+                and the
+                (only) thing.
+            two: Another.
+        """
+        return 0
+
+    assert unbroken(unbroken(verb)).__doc__ == (
+        "Do it.\n\nA longer story (in two lines).\n\n"
+        "Args:\n    one: The first, and the (only) thing.\n    two: Another."
+    )
+
+
+def test_positional_arguments_have_names_and_none_may_be_given() -> None:
+    assert "simtrack score [-h] RUN_DIR RESULTS [--out PATH]" in simtrack_command("score", "--help").stdout
+    assert "simtrack query [-h] RUN_DIR QUESTION" in simtrack_command("query", "--help").stdout
+    assert "duration = 0.0 is not valid" in refused("run", "--duration", "0", "--agent", "None")
+    assert "unknown scene" in refused("sweep", "nowhere", "--over", "noise=0:1", "--duration", "None")
 
 
 def test_scenes_are_listed() -> None:
