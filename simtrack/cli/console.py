@@ -65,7 +65,7 @@ _LEAST_TEXT = 20
 
 
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: Sequence[int] = ()) -> None:
-    """Print a table; `right` are the columns to be aligned right. Too wide a one folds text and headers, not numbers."""
+    """Print a table; `right` are the columns to be aligned right. Too wide, it folds text and headers, not numbers."""
     from rich.table import Table
     from rich.text import Text
 
