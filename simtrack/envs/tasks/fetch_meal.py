@@ -23,7 +23,7 @@ OPENED = np.deg2rad(60.0)
 """Radians from which on the fridge counts as opened."""
 CLOSED = np.deg2rad(4.0)
 """Radians up to which the microwave counts as closed."""
-SHELF_HEIGHTS, CAVITY_HEIGHTS = (0.55, 1.02), (0.7, 1.06)
+SHELF_HEIGHTS, CAVITY_HEIGHTS = (0.55, 1.03), (0.7, 1.06)
 """Metres above the floor within which the arm works from the front: boards of fridges, floors of microwaves."""
 HEADROOM = 0.2
 """Metres of free height above a board."""
@@ -61,7 +61,7 @@ class FetchMeal(Task):
     """
 
     script = "fetch-meal"
-    scene = "kitchen:0"
+    scene = "open_kitchen:0"
     seconds = 240.0
     macros = ("articulate", "take", "insert")
 
@@ -73,12 +73,13 @@ class FetchMeal(Task):
         """
         if scene.static.builder == "room":
             from simtrack.simulation.building.rooms.functional import functional_room
-            from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
+            from simtrack.simulation.building.rooms.plan import kind_of
 
-            kind: RoomKind | None = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
-            scene = mjcf_scene(functional_room(scene.static.seed or 0, kind))
+            scene = mjcf_scene(functional_room(scene.static.seed or 0, kind_of(scene.static.config)))
         if scene.static.builder != "mjcf":
-            raise InvalidValueError("scene", scene.name, "a kitchen (kitchen:SEED), or an MJCF file of one")
+            raise InvalidValueError(
+                "scene", scene.name, "a kitchen (open_kitchen:SEED, kitchen:SEED), or an MJCF file of one"
+            )
         world = mjcf_building(scene, supports=False)
         fridge = appliance(world, "fridge", SHELF_HEIGHTS, scene)
         microwave = appliance(world, "microwave", CAVITY_HEIGHTS, scene)
