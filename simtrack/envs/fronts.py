@@ -23,6 +23,8 @@ SPACING = 0.02
 SEALING, LEANING = np.deg2rad(25.0), np.deg2rad(58.0)
 """Radians off a face's normal at which the cup finds hold, and up to which it may lean then."""
 LEANS = np.deg2rad([0, 12, -12, 25, -25, 40, -40, 58, -58])
+FROM_RIM = 0.05
+"""Metres from the upper and lower end of a door or drawer within which it is not held if there is another place."""
 FROM_EDGE = 0.1
 """Metres from the outermost point at which a door is best moved: beside its handle."""
 COMFORT = 0.65
@@ -95,6 +97,9 @@ class Front:
         a, spots = self.articulation, self.spots
         if not len(spots):
             return None
+        low, high = float(a.vertices[:, 2].min()) + FROM_RIM, float(a.vertices[:, 2].max()) - FROM_RIM
+        inner = (spots[:, 2] > low) & (spots[:, 2] < high)
+        spots = spots[inner] if inner.any() else spots
         cost = np.abs(spots[:, 2] - height)
         if a.kind == "revolute":
             along = np.cross(self.outwards, a.axis)

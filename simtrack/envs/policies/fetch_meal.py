@@ -15,7 +15,8 @@ from simtrack.envs.planning import believed
 from simtrack.envs.policies import Briefing
 from simtrack.envs.settings import CONTROL_HZ
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import apply, inverse, transform_planar, yaw_of
+from simtrack.geometry.transforms import apply, inverse, transform_planar, wrapped, yaw_of
+from simtrack.perception.tracking.articulation import motion
 from simtrack.simulation.agents.floor_plan import FloorPlan
 
 Plan: TypeAlias = Generator[Float32, None, None]
@@ -23,8 +24,8 @@ Plan: TypeAlias = Generator[Float32, None, None]
 Tried: TypeAlias = Generator[Float32, None, bool]
 """The same, and whether it worked."""
 
-FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad(82.0), np.deg2rad(72.0)
-"""Radians: far enough to reach in; a microwave's door is pushed shut again from the front."""
+FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad([95.0, 88.0, 82.0]), np.deg2rad([72.0])
+"""Radians, the first that the arm can do: far enough to reach in; a microwave's is pushed shut from the front."""
 NEARLY = np.deg2rad(9.0)
 """Radians off the wanted position that do not matter."""
 SHUT = np.deg2rad(3.0)
@@ -47,6 +48,12 @@ HALF_WIDTH = 0.085
 """Metres to each side of the item's middle that must be free on its way: hand and item."""
 RUN_UP = 0.4
 """Metres before the place where something is inserted from which the robot drives straight."""
+STALLED, STILL = 20, 0.03
+"""Steps in which the base moves by less than so many metres and radians: it does not get on."""
+BUMPER = 0.33
+"""Metres from the base's middle at which something is taken to be that it ran into."""
+ELSEWHERE = 0.08
+"""Metres from where something failed that are tried next."""
 TRIES = 3
 
 
@@ -65,6 +72,7 @@ class FetchMealPolicy:
     def begin(self, rng: np.random.Generator) -> None:
         """See `simtrack.envs.policies.Policy`."""
         self._floor = FloorPlan(self._briefing.static_map)
+        self._failed: list[Float64] = []
         self._gaze: Float64 | None = None
         self._lift = 0.3
         self._plan = self._fetch()
@@ -83,36 +91,48 @@ class FetchMealPolicy:
     def _fetch(self) -> Plan:
         while True:
             if not self._holds:
-                yield from self._open(self._microwave, MICROWAVE_OPEN)
-                yield from self._open(self._fridge, FRIDGE_OPEN, more=True)
+                if not (yield from self._open(self._microwave, MICROWAVE_OPEN)):
+                    continue
+                if not (yield from self._open(self._fridge, FRIDGE_OPEN, more=True)):
+                    continue
                 yield from self._take()
             if self._holds:
                 yield from self._insert()
             if not self._holds and self._is_in():
-                yield from self._open(self._microwave, 0.0)
+                yield from self._open(self._microwave, np.zeros(1))
             yield self._move()
 
-    def _open(self, front: Front, angle: float, *, more: bool = False) -> Tried:
-        """Bring a door to an angle off its closed position; `more`: or beyond. Closes it with an angle of 0."""
-        a = front.articulation
-        wanted = min(a.lower + angle, a.upper)
-        for _ in range(TRIES):
+    def _open(self, front: Front, angles: Float64, *, more: bool = False) -> Tried:
+        """Bring a door to the first of some angles off its closed position that can be done; closes it with 0.
+
+        With `more`, any angle from the last of them on will do.
+        """
+        a, angle = front.articulation, float(angles[-1])
+        least = min(a.lower + angle, a.upper)
+        for attempt in range(TRIES + 1):
             yield from self._see(front)
             q = self._joint(a).position
             near = SHUT if angle == 0.0 else NEARLY
-            if abs(q - wanted) < near or (more and q > wanted):
+            if abs(q - least) < near or (more and q > least):
+                self._failed.clear()
                 return True
             yield from self._raise(0.3)
             spot = front.spot(COMFORT + 0.3)
-            stance = None if spot is None else self._door_stance(front, spot, q, wanted)
-            if spot is None or stance is None:
-                return False
-            yield from self._drive(stance)
-            yield from self._see(front, move=False)
-            q = self._joint(a).position
-            push = wanted if angle > 0.0 else a.lower - 0.03
-            yield from self._ask(Request("articulate", self._in_base(front.at(spot, q)[0]), push))
-            yield from self._straight(-0.1)
+            stance, wanted = None, least
+            for wanted in np.minimum(a.lower + angles[min(attempt, len(angles) - 1) :], a.upper).tolist():
+                stance = None if spot is None else self._door_stance(front, spot, q, wanted)
+                if stance is not None:
+                    break
+            if spot is None or stance is None or attempt == TRIES:
+                break
+            if (yield from self._drive(stance)):
+                yield from self._see(front, move=False)
+                q = self._joint(a).position
+                push = wanted if angle > 0.0 else a.lower - 0.03
+                yield from self._ask(Request("articulate", self._in_base(front.at(spot, q)[0]), push))
+                yield from self._straight(-0.1)
+            self._failed.append(stance[:2, 3])  # if it is tried again, then from elsewhere
+        self._failed.clear()
         return False
 
     def _take(self) -> Tried:
@@ -126,10 +146,12 @@ class FetchMealPolicy:
                 continue
             place = track.T_map_object[:3, 3]
             yield from self._raise(float(np.clip(place[2] - COMFORT, 0.0, 0.35)))
-            stance = self._stance(place, -self._fridge.outwards_closed, BEFORE, 0.0)
+            inwards = -self._fridge.outwards_closed
+            side = self._hinge_side(self._fridge)
+            stance = next((s for r in (RUN_UP, 0.0) if (s := self._stance(place, inwards, BEFORE, 0.0, r, side))), None)
             if stance is None:
                 return False
-            yield from self._drive(stance)
+            yield from self._come(*stance)
             yield from self._look_for(item, place)
             track = believed(self._belief, item)
             if track is not None:
@@ -137,6 +159,8 @@ class FetchMealPolicy:
             yield from self._straight(-0.4)
             if self._holds:
                 return True
+            if self._joint(self._fridge.articulation).position < self._fridge.articulation.lower + FRIDGE_OPEN[-1]:
+                return False
         return False
 
     def _insert(self) -> Plan:
@@ -146,18 +170,21 @@ class FetchMealPolicy:
         if stance is None:
             yield self._move()
             return
-        before = stance.copy()  # with what is held stretched out, the last metre is driven straight
-        before[:2, 3] -= RUN_UP * stance[:2, 0]
         self._gaze = place
-        yield from self._drive(before)
-        yield from self._straight(RUN_UP)
+        yield from self._come(*stance)
         yield from self._wait(8)
         yield from self._ask(Request("insert", self._in_base(place)))
         yield from self._straight(-0.3)
+        yield from self._wait(5)
 
     def _is_in(self) -> bool:
+        """Whether the item may be in the microwave: nothing that was seen lately speaks against it."""
         track = believed(self._belief, self._goal.subject)
-        return self._outcome is Outcome.DONE or track is not None
+        if track is None or not self._fresh(track.last_seen):
+            return self._outcome is Outcome.DONE
+        T_map_board, size = self._board
+        x, y, z = apply(inverse(T_map_board), track.T_map_object[:3, 3][None])[0]
+        return bool(abs(x) < size[0] / 2 and abs(y) < size[1] / 2 and z > -0.02)
 
     # ------------------------------------------------------------------------------------------------- what is believed
 
@@ -184,7 +211,7 @@ class FetchMealPolicy:
         opened = self._joint(a).position - a.lower
         hinge = float(apply(inverse(T_map_board), a.anchor[None])[0][1])
         width = float(np.ptp((a.vertices - a.anchor) @ T_map_board[:3, 1]))
-        side = -float(np.sign(hinge))
+        side = self._hinge_side(self._microwave)
         tip = hinge + side * width * float(np.cos(opened))
         far = side * (size[1] / 2 - HALF_WIDTH)
         # From the leaf's tip to the far wall there has to be room for the hand.
@@ -192,6 +219,12 @@ class FetchMealPolicy:
         height = float(self._briefing.models[self._goal.subject].extents[2]) / 2
         local = np.array([size[0] / 2 - INTO, y, height])
         return apply(T_map_board, local[None])[0], -T_map_board[:3, 0], side
+
+    def _hinge_side(self, front: Front) -> float:
+        """1 if the hinge of a door is on the left of who looks at it, else -1."""
+        a, out = front.articulation, front.outwards_closed
+        leaf = apply(motion(a, a.lower), a.vertices.astype(float)).mean(axis=0)
+        return 1.0 if float(np.cross(out, leaf - a.anchor)[2]) > 0.0 else -1.0
 
     # --------------------------------------------------------------------------------------------------------- stances
 
@@ -206,7 +239,8 @@ class FetchMealPolicy:
                 for forward in AHEAD:
                     T = transform_planar(0.0, 0.0, float(np.arctan2(ahead[1], ahead[0])))
                     T[:2, 3] = place[:2] - (T[:3, :3] @ [forward, left, 0.0])[:2]
-                    if self._floor.clearance_at(*T[:2, 3].tolist()) > ROOM:
+                    tried = any(np.linalg.norm(T[:2, 3] - other) < ELSEWHERE for other in self._failed)
+                    if not tried and self._floor.clearance_at(*T[:2, 3].tolist()) > ROOM:
                         yield T
 
     def _door_stance(self, front: Front, spot: Float64, position: float, wanted: float) -> Float64 | None:
@@ -225,8 +259,11 @@ class FetchMealPolicy:
 
     def _stance(
         self, place: Float64, inwards: Float64, stroke: float, lift: float, run_up: float = 0.0, side: float = 0.0
-    ) -> Float64 | None:
-        """Where to stand so that a level cup goes straight to a place and has come from `stroke` metres before it."""
+    ) -> tuple[Float64, float] | None:
+        """Where to stand so that a level cup goes straight to a place and has come from `stroke` metres before it.
+
+        The robot drives straight for the last `run_up` metres, which are the second of what is returned.
+        """
         for T in self._candidates(place, inwards, side):
             behind = T[:2, 3] - run_up * T[:2, 0]
             if self._floor.clearance_at(*behind.tolist()) < ROOM:
@@ -237,7 +274,7 @@ class FetchMealPolicy:
             if inside is None:
                 continue
             if self._reach.joints(at - stroke * ahead, ahead, self._lift, level=True) is not None:
-                return T
+                return T, run_up
         return None
 
     # ------------------------------------------------------------------------------------------------------- movements
@@ -286,14 +323,25 @@ class FetchMealPolicy:
             yield self._move()
         return believed(self._belief, name)
 
+    def _come(self, stance: Float64, run_up: float) -> Plan:
+        """Drive to a stance (4, 4), the last metres straight: the arm is stretched out."""
+        before = stance.copy()
+        before[:2, 3] -= run_up * stance[:2, 0]
+        yield from self._drive(before)
+        yield from self._straight(float((stance[:2, 3] - self._belief.localization.T_map_base[:2, 3]) @ stance[:2, 0]))
+
     def _drive(self, T_map_goal: Float64, near: float = 0.03) -> Tried:
         """Drive to a pose: along a planned way, then straight there, then turn."""
-        goal, yaw = T_map_goal[:2, 3], yaw_of(T_map_goal)
-        path = self._floor.plan(self._belief.localization.T_map_base[:2, 3], goal)
-        way = [goal] if path is None else [*path[3:].tolist(), goal]
-        index = 0
+        goal, yaw, been = T_map_goal[:2, 3], yaw_of(T_map_goal), list[Float64]()
+        way, index = self._way(goal), 0
         for _ in range(300):
             xy = self._belief.localization.T_map_base[:2, 3]
+            if self._stalled(been):
+                if float(np.linalg.norm(goal - xy)) < BUMPER:
+                    break  # the arm leans against something
+                yield from self._around()
+                way, index = self._way(goal), 0
+                been.clear()
             while index < len(way) - 1 and float(np.linalg.norm(way[index] - xy)) < 0.25:
                 index += 1
             offset = np.asarray(way[index]) - xy
@@ -310,18 +358,37 @@ class FetchMealPolicy:
             left = float(np.linalg.norm(goal - xy))
             speed = 0.0 if abs(bearing) > 0.35 else min(0.45, 0.8 * left + 0.03)
             yield self._move(linear=speed, angular=float(np.clip(1.8 * bearing, -0.8, 0.8)))
+        been.clear()
         for _ in range(120):
             gap = wrapped(yaw - yaw_of(self._belief.localization.T_map_base))
-            if abs(gap) < 0.02:
+            if abs(gap) < 0.02 or self._stalled(been):
                 break
             yield self._move(angular=float(np.clip(1.6 * gap, -0.7, 0.7) + 0.02 * np.sign(gap)))
         yield from self._wait(4)
         return float(np.linalg.norm(self._belief.localization.T_map_base[:2, 3] - goal)) < 0.1
 
+    def _way(self, goal: Float64) -> list[Float64]:
+        """Places (2,) of the map that lead to a goal."""
+        path = self._floor.plan(self._belief.localization.T_map_base[:2, 3], goal)
+        return [goal] if path is None else [*path[3:], goal]
+
+    def _around(self) -> Plan:
+        """Something is in the way that the survey does not show: remember it, and back off."""
+        T = self._belief.localization.T_map_base
+        ahead = [turned(T[:3, 0], angle) for angle in np.deg2rad([-25.0, 0.0, 25.0]).tolist()]
+        self._floor.block(np.array([T[:2, 3] + BUMPER * direction[:2] for direction in ahead]))
+        yield from self._straight(-0.2)
+
+    def _stalled(self, been: list[Float64]) -> bool:
+        """Remember where the base is; whether it does not get on, because the arm leans against something."""
+        T = self._belief.localization.T_map_base
+        been.append(np.array([*T[:2, 3].tolist(), yaw_of(T)]))
+        return len(been) > STALLED and bool(np.abs(been[-1] - been[-STALLED]).max() < STILL)
+
     def _straight(self, distance: float) -> Plan:
         """Go straight ahead, or back if negative."""
         begin = self._belief.localization.T_map_base[:2, 3].copy()
-        for _ in range(60):
+        for _ in range(40):
             left = abs(distance) - float(np.linalg.norm(self._belief.localization.T_map_base[:2, 3] - begin))
             if left < 0.02:
                 break
@@ -399,8 +466,3 @@ def _board(briefing: Briefing, name: str, front: Front) -> tuple[Float64, Float6
     T[:3, :3] = np.stack([out, np.cross([0.0, 0.0, 1.0], out), [0.0, 0.0, 1.0]], axis=1)
     T[:3, 3] = T_map_face[:3, 3]
     return T, np.asarray(size)[::-1] if abs(local[1]) > abs(local[0]) else np.asarray(size)
-
-
-def wrapped(angle: float) -> float:
-    """The same angle between -pi and pi, radians."""
-    return float(np.arctan2(np.sin(angle), np.cos(angle)))

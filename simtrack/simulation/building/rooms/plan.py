@@ -16,7 +16,8 @@ RoomKind: TypeAlias = Literal["bedroom", "living", "study", "kitchen", "open-kit
 KINDS: tuple[RoomKind, ...] = ("bedroom", "living", "study", "kitchen")
 """Those that are drawn from a seed."""
 ALL_KINDS: tuple[RoomKind, ...] = (*KINDS, "open-kitchen")
-"""Those that can be asked for; in an ``open-kitchen`` the floor before fridge and microwave is kept clear."""
+"""Those that can be asked for; in an ``open-kitchen`` the floor before fridge and microwave is kept clear,
+and nothing lies or leans about on it that no survey would show."""
 SERVED: dict[RoomKind, tuple[tuple[str, str | None], ...]] = {
     "open-kitchen": (("fridge", None), ("counter", "microwave"))
 }
@@ -26,14 +27,14 @@ AT_WALL: dict[RoomKind, tuple[str, ...]] = {
     "living": ("sofa", "cabinet", "cabinet", "table", "board"),
     "study": ("table", "cabinet", "cabinet", "fridge", "board"),
     "kitchen": ("counter", "counter", "fridge", "cabinet", "board"),
-    "open-kitchen": ("counter", "cabinet", "board"),
+    "open-kitchen": ("counter", "cabinet"),
 }
 IN_THE_OPEN: dict[RoomKind, tuple[str, ...]] = {
     "bedroom": ("chair", "bag", "plant", "box"),
     "living": ("table", "chair", "chair", "plant", "bag"),
     "study": ("table", "chair", "chair", "bag", "plant", "box"),
     "kitchen": ("table", "chair", "chair", "chair", "plant", "bag"),
-    "open-kitchen": ("table", "chair", "chair", "plant", "bag"),
+    "open-kitchen": ("table", "chair", "chair"),
 }
 ON_WALLS: dict[RoomKind, tuple[str, ...]] = {
     "bedroom": ("shelf", "picture", "picture"),
