@@ -24,7 +24,7 @@ Plan: TypeAlias = Generator[Float32, None, None]
 Tried: TypeAlias = Generator[Float32, None, bool]
 """The same, and whether it worked."""
 
-FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad([95.0, 88.0, 82.0]), np.deg2rad([72.0])
+FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad([95.0, 88.0, 82.0, 75.0]), np.deg2rad([72.0])
 """Radians, the first that the arm can do: far enough to reach in; a microwave's is pushed shut from the front."""
 NEARLY = np.deg2rad(9.0)
 """Radians off the wanted position that do not matter."""
@@ -38,6 +38,8 @@ TURNS = np.deg2rad([0, 15, -15, 30, -30, 45, -45])
 ASIDE = (0.0, 0.2, -0.2, 0.35, -0.35)
 AHEAD = (0.8, 0.75, 0.85, 0.7, 0.9, 0.65)
 """Where a thing may be from the base that the arm works on: radians off straight, metres to the left, ahead."""
+LIFTS = (0.3, 0.2)
+"""Metres of the torso with which doors are worked."""
 ROOM = 0.29
 """Metres around the middle of the base that must be free where it stands."""
 CAMERA_HEIGHT = 1.12
@@ -116,15 +118,12 @@ class FetchMealPolicy:
             if abs(q - least) < near or (more and q > least):
                 self._failed.clear()
                 return True
-            yield from self._raise(0.3)
-            spot = front.spot(COMFORT + 0.3)
-            stance, wanted = None, least
-            for wanted in np.minimum(a.lower + angles[min(attempt, len(angles) - 1) :], a.upper).tolist():
-                stance = None if spot is None else self._door_stance(front, spot, q, wanted)
-                if stance is not None:
-                    break
-            if spot is None or stance is None or attempt == TRIES:
+            targets = np.minimum(a.lower + angles[min(attempt, len(angles) - 1) :], a.upper).tolist()
+            found = self._door_plan(front, q, targets)
+            if found is None or attempt == TRIES:
                 break
+            spot, stance, wanted, lift = found
+            yield from self._raise(lift)
             if (yield from self._drive(stance)):
                 yield from self._see(front, move=False)
                 q = self._joint(a).position
@@ -243,14 +242,26 @@ class FetchMealPolicy:
                     if not tried and self._floor.clearance_at(*T[:2, 3].tolist()) > ROOM:
                         yield T
 
-    def _door_stance(self, front: Front, spot: Float64, position: float, wanted: float) -> Float64 | None:
+    def _door_plan(
+        self, front: Front, position: float, targets: list[float]
+    ) -> tuple[Float64, Float64, float, float] | None:
+        """Where a door is held, where the robot stands, to which of some positions, first the best, and the torso."""
+        for wanted in targets:
+            for lift in LIFTS:
+                spot = front.spot(COMFORT + lift)
+                stance = None if spot is None else self._door_stance(front, spot, position, wanted, lift)
+                if spot is not None and stance is not None:
+                    return spot, stance, wanted, lift
+        return None
+
+    def _door_stance(self, front: Front, spot: Float64, position: float, wanted: float, lift: float) -> Float64 | None:
         place, inwards = front.at(spot, position)
         best: tuple[float, Float64] | None = None
         for T in self._candidates(place, inwards):
             end = followed(front, spot, position, wanted, T)
             if self._floor.clearance_at(*end[:2, 3].tolist()) < ROOM:
                 continue
-            lean = self._reach.follows(front, spot, (position, wanted), T, self._lift)
+            lean = self._reach.follows(front, spot, (position, wanted), T, lift)
             if lean is not None and (best is None or lean < best[0]):
                 best = lean, T
             if best is not None and best[0] < np.deg2rad(59.0):
