@@ -26,6 +26,8 @@ Tried: TypeAlias = Generator[Float32, None, bool]
 
 FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad([95.0, 88.0, 82.0, 75.0]), np.deg2rad([72.0])
 """Radians, the first that the arm can do: far enough to reach in; a microwave's is pushed shut from the front."""
+ENOUGH = np.deg2rad(60.0)
+"""Radians from which on it is worth a try to reach into the fridge."""
 NEARLY = np.deg2rad(9.0)
 """Radians off the wanted position that do not matter."""
 SHUT = np.deg2rad(3.0)
@@ -132,7 +134,8 @@ class FetchMealPolicy:
                 yield from self._straight(-0.1)
             self._failed.append(stance[:2, 3])  # if it is tried again, then from elsewhere
         self._failed.clear()
-        return False
+        yield from self._wait(10)
+        return more and self._joint(a).position > a.lower + ENOUGH
 
     def _take(self) -> Tried:
         item = self._goal.subject
@@ -158,7 +161,7 @@ class FetchMealPolicy:
             yield from self._straight(-0.4)
             if self._holds:
                 return True
-            if self._joint(self._fridge.articulation).position < self._fridge.articulation.lower + FRIDGE_OPEN[-1]:
+            if self._joint(self._fridge.articulation).position < self._fridge.articulation.lower + ENOUGH:
                 return False
         return False
 
