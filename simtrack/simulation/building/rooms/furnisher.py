@@ -24,8 +24,10 @@ LEAN = (np.radians(9.0), np.radians(15.0))
 """Radians off the vertical of what leans."""
 AJAR = 0.35
 """Share of a joint's range from which one can look and reach into what it closes."""
-SERVICE = 1.3
-"""Metres of clear floor before what a robot is to work at."""
+SERVICE = (1.3, 1.7)
+"""Metres, depth and width, of clear floor before what a robot is to work at."""
+AMID = 0.2
+"""Metres off the middle of what it stands on, at most, of what a robot is to work at."""
 OPENS = 0.45
 """Chance of a joint to be open."""
 
@@ -128,6 +130,7 @@ class Furnisher:
         """Put a closed thing to a wall and keep the floor before it clear; stand another one at its front edge."""
         name, model = self.make(family)
         depth, width = model.extents[[1, 0]].tolist()
+        clear = SERVICE[0], max(width, SERVICE[1])
         footprint, heading = _Footprint(model.extents[[1, 0, 2]]), 0.0
         for _ in range(60):
             before = self.space.free.copy(), self.space.ways
@@ -136,12 +139,12 @@ class Furnisher:
                 return
             x, y, heading = found
             front = np.array([np.cos(heading), np.sin(heading)])
-            middle = (x, y) + front * (depth / 2 + SERVICE / 2 + 0.06)
-            if self.space.keep_clear(*middle.tolist(), heading, SERVICE, max(width, SERVICE)):
+            middle = (x, y) + front * (depth / 2 + clear[0] / 2 + 0.06)
+            if self.space.keep_clear(*middle.tolist(), heading, *clear):
                 T = _standing(model, x, y, heading + np.pi / 2, 0.0)
                 known = len(self.faces)
                 self.add(name, model, T, {})
-                half = np.full(2, SERVICE / 2)
+                half = np.full(2, clear[0] / 2)
                 self.bounds.append(np.array([[*(middle - half), 0.0], [*(middle + half), 1.8]]))
                 if on_top is not None:
                     self._at_front_edge(on_top, max(self.faces[known:], key=lambda face: float(face.T_map_face[2, 3])))
@@ -155,7 +158,12 @@ class Furnisher:
         turning = np.abs([[np.cos(turn), np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         half = turning @ model.extents[:2] / 2
         free = face.size / 2 - half - 0.012
-        at = np.array([self.rng.uniform(-free[0], free[0]), self.rng.uniform(-free[1], min(0.05 - free[1], free[1]))])
+        at = np.array(
+            [
+                self.rng.uniform(*np.clip([-free[0], free[0]], -AMID, AMID)),
+                self.rng.uniform(-free[1], min(0.05 - free[1], free[1])),
+            ]
+        )
         face.taken.append((at, half + (0.08, 0.0)))
         face.taken.append((np.array([at[0], -face.size[1] / 2]), np.array([half[0] + 0.08, 0.1])))
         T = face.T_map_face @ transform_planar(float(at[0]), float(at[1]), turn)
