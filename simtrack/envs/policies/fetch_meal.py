@@ -93,8 +93,9 @@ class FetchMealPolicy:
     # ----------------------------------------------------------------------------------------------------------- plans
 
     def _fetch(self) -> Plan:
+        put = False
         while True:
-            if not self._holds:
+            if not (self._holds or put):
                 if not (yield from self._open(self._microwave, MICROWAVE_OPEN)):
                     continue
                 if not (yield from self._open(self._fridge, FRIDGE_OPEN, more=True)):
@@ -102,14 +103,15 @@ class FetchMealPolicy:
                 yield from self._take()
             if self._holds:
                 yield from self._insert()
-            if not self._holds and self._is_in():
+                put = not self._holds and self._is_in()
+            if put:
                 yield from self._open(self._microwave, np.zeros(1))
             yield self._move()
 
     def _open(self, front: Front, angles: Float64, *, more: bool = False) -> Tried:
         """Bring a door to the first of some angles off its closed position that can be done; closes it with 0.
 
-        With `more`, any angle from the last of them on will do.
+        With `more`, any angle from the last of them on will do, and `ENOUGH` if no more can be done.
         """
         a, angle = front.articulation, float(angles[-1])
         least = min(a.lower + angle, a.upper)
@@ -170,7 +172,7 @@ class FetchMealPolicy:
         yield from self._raise(float(np.clip(place[2] + 0.04 - COMFORT, 0.0, 0.35)))
         stance = self._stance(place - 0.03 * inwards, inwards, STROKE, LIFT, RUN_UP, side)
         if stance is None:
-            yield self._move()
+            yield from self._wait(10)
             return
         self._gaze = place
         yield from self._come(*stance)
