@@ -111,7 +111,9 @@ class FetchMealPolicy(Driver):
             yield from self._raise(lift)
             if (yield from self._drive(stance)):
                 yield from self._see(front, move=False)
-                q = self._joint(a).position
+                q, here = self._joint(a).position, self._belief.localization.T_map_base
+                can = (w for w in targets if self._reach.follows(front, spot, (q, w), here, lift) is not None)
+                wanted = next(can, wanted)  # from where it has really come to stand
                 push = wanted if angle > 0.0 else a.lower - 0.03
                 yield from self._ask(Request("articulate", self._in_base(front.at(spot, q)[0]), push))
                 yield from self._straight(-0.1)
