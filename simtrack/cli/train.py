@@ -68,8 +68,11 @@ def _train_agent(out: Path, minutes: float, seed: int) -> int:
     """Show each episode, and draw the curve of what was learned."""
     from simtrack.cli import console
     from simtrack.envs.learning import GazeTraining, LearnedEpisode
+    from simtrack.errors import InvalidValueError
     from simtrack.report.learning import draw_learning
 
+    if not minutes > 0.0:
+        raise InvalidValueError("minutes", minutes, "a time above 0")
     training = GazeTraining(out, seed)
 
     def show(episode: LearnedEpisode) -> None:

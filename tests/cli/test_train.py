@@ -33,6 +33,8 @@ def test_a_detector_is_trained_by_one_command(tmp_path: Path, monkeypatch: pytes
             ("train", "detector", "--data", "{tmp}", "--out", "{tmp}/out", "--minutes", "0"),
             "minutes = 0.0 is not valid",
         ),
+        (("train", "detector", "--out", "{tmp}/out"), "data = None is not valid"),
+        (("train", "agent", "--out", "{tmp}/out", "--minutes", "0"), "minutes = 0.0 is not valid"),
         (("evaluate", "detector"), "the folder of a generated data set"),
         (("evaluate", "detector", "--data", "{tmp}", "--count", "0"), "count = 0 is not valid"),
         (("run", "--detector", "{tmp}"), "boxes.onnx: no such file"),
