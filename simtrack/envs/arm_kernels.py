@@ -81,7 +81,7 @@ def missing(
         turn[2] = np.arctan2(np.sin(gap), np.cos(gap))
         close = close and abs(turn[2]) < 2.0 * upright
     error[3:] = turn
-    return (error[:5].copy() if mode == DOWNWARDS else error), close
+    return (error[:5].copy() if mode == DOWNWARDS else error), bool(close)
 
 
 @njit(cache=True, nogil=True)

@@ -35,7 +35,7 @@ class LearnedEpisode:
     known_share: float
 
 
-class Looking(gym.Wrapper[Float32, Float32, Any, Float32]):
+class Looking(gym.Wrapper):
     """Actions are postures that are held for some steps, observations are features of the belief; see `Gaze`."""
 
     def __init__(self, env: gym.Env, episodes: int = 0) -> None:
@@ -169,7 +169,7 @@ def layers_of(weights: Mapping[str, Any]) -> dict[str, Float32]:
     }
 
 
-def _save(path: Path, arrays: Mapping[str, Float32]) -> None:
+def _save(path: Path, arrays: Mapping[str, Any]) -> None:
     with path.open("wb") as file:
         np.savez(file, **arrays)
 

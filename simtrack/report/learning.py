@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 BLUE, ORANGE, GREY = "#4c9be8", "#f28e2b", "#555555"
-STYLE = {
+STYLE: Any = {
     "font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.4,
     "legend.frameon": False, "figure.facecolor": "white",
 }  # fmt: skip
@@ -30,9 +31,9 @@ def draw_learning(
     minutes, *curves = (np.array(column) for column in zip(*episodes, strict=True))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")
-        for k, (axes, values, name) in enumerate(
-            zip(figure.subplots(1, 2), curves, ("return of an episode", "known share"), strict=True)
-        ):
+        both = figure.subplots(1, 2)
+        for k, name in enumerate(("return of an episode", "known share")):
+            axes, values = both[k], curves[k]
             axes.plot(minutes, values, ".", color=BLUE, alpha=0.35, markersize=4, label="episodes of the training")
             count = min(SMOOTH, len(values))
             mean = np.convolve(values, np.full(count, 1.0 / count), "valid")
@@ -41,5 +42,5 @@ def draw_learning(
                 axes.axhline(figures[k], color=GREY, linestyle=style, linewidth=1.2, label=policy)
             axes.set_xlabel("minutes of CPU time")
             axes.set_title(name)
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
+        figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
         figure.savefig(path, dpi=150)

@@ -69,7 +69,7 @@ def test_turning_with_the_world_changes_nothing_that_is_seen(rng: np.random.Gene
 def test_speeds_lead_to_the_posture_that_is_asked_for(rng: np.random.Generator, wanted: tuple[float, ...]) -> None:
     from simtrack.envs.actions import AXES
 
-    gaze, arrays = Gaze(30.0), belief(rng, 2.9)
+    gaze, arrays, heading = Gaze(30.0), belief(rng, 2.9), 2.9
     gaze.features(arrays)
     for _ in range(60):
         speeds = gaze.speeds(np.array(wanted, np.float32), arrays) * list(AXES.values()) / CONTROL_HZ

@@ -139,8 +139,9 @@ class Furnisher:
                 return
             x, y, heading = found
             front = np.array([np.cos(heading), np.sin(heading)])
-            middle = (x, y) + front * (depth / 2 + clear[0] / 2 + 0.06)
-            if self.space.keep_clear(*middle.tolist(), heading, *clear):
+            middle = np.array([x, y]) + front * (depth / 2 + clear[0] / 2 + 0.06)
+            ahead, aside = middle.tolist()
+            if self.space.keep_clear(ahead, aside, heading, clear[0], clear[1]):
                 T = _standing(model, x, y, heading + np.pi / 2, 0.0)
                 known = len(self.faces)
                 self.add(name, model, T, {})
