@@ -67,7 +67,13 @@ def build_stage(stage: str, given: str, context: StageContext) -> object:
 
     """
     if given.startswith(EXEC):
-        return ProcessTracker(_command(stage, given), context.models)
+        program = ProcessTracker(_command(stage, given), context.models)
+        try:
+            program.start()
+        except (OSError, ValueError) as error:
+            program.close()
+            raise StageError(stage, given, f"is not ready: {error}") from error
+        return program
     maker = _maker(stage, given)
     parts = _parts(stage, given, maker, context)
     try:
