@@ -114,6 +114,7 @@ def test_every_package_that_is_imported_is_a_declared_dependency() -> None:
         *extras["distributed"],
         *extras["train"],
         *extras["openvino"],
+        *extras["rl"],
     ]
     declared = {re.split(r"[\[<>=~!; ]", line)[0] for line in lines}
     modules = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in declared} | {"simtrack"}

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 def env(
     env_id: Annotated[str, tyro.conf.Positional],
-    policy: Literal["scripted", "random", "still"] = "scripted",
+    policy: str = "scripted",
     episodes: int = 1,
     seed: int = 0,
     scene: tuple[str, ...] = (),
@@ -30,7 +30,7 @@ def env(
 
     Args:
         env_id: Id of the environment, e.g. ActivePerception or simtrack/ActivePerception-v0.
-        policy: What acts.
+        policy: What acts: scripted, random, still, or the folder in which simtrack train agent has left a network.
         episodes: How many are played; episode k has the seed SEED + k.
         seed: Of the first episode.
         scene: Name or path of a scene; the task's own if not given. With several, such as a kitchen and its

@@ -33,7 +33,8 @@ def run(
     """Simulate a scene in a closed loop, measure every stage, write a report.
 
     Args:
-        scene: Name of a scene (see `simtrack scenes`), or path of its folder or YAML file.
+        scene: Name of a scene (see `simtrack scenes`), NAME:SEED such as rooms:7, or path of its folder, YAML or MJCF
+            (.xml) file.
         duration: Simulated seconds; the scene's own (30 for the workbench) if not given.
         seed: Of everything random.
         out: Folder for the results; runs/SCENE-SEED if not given.

@@ -1,4 +1,4 @@
-"""``simtrack train``: let the detector's networks learn from a generated data set."""
+"""``simtrack train``: let the detector's networks learn from a generated data set, or an agent from what it does."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -11,29 +11,38 @@ if TYPE_CHECKING:
 
 
 def train(
-    what: Annotated[Literal["detector"], tyro.conf.Positional],
-    data: Path,
+    what: Annotated[Literal["detector", "agent"], tyro.conf.Positional],
     out: Path,
+    data: Path | None = None,
     minutes: float | None = None,
     seed: int = 0,
     part: Literal["both", "boxes", "keypoints"] = "both",
 ) -> int:
-    """Let the detector's networks learn from a generated data set. The same command carries on where it was stopped.
+    """Let the detector or an agent learn. The same command carries on where it was stopped.
 
-    Writes boxes.onnx and keypoints.onnx, which `simtrack run --detector DIR` takes. Needs the extra train.
+    The detector's networks learn from a generated data set: boxes.onnx and keypoints.onnx, which `simtrack run
+    --detector DIR` takes (extra train). An agent learns by PPO where to look in ActivePerception, from what is
+    believed: `simtrack env ActivePerception --policy DIR` lets it play (extra rl).
 
     Args:
         what: What learns.
-        data: Folder of a data set that `simtrack generate` made, with the format bop among its writers.
         out: Folder for checkpoints, logs and networks.
-        minutes: Of computing time for each network, over all calls; until it has learned if not given.
+        data: For the detector: folder of a data set that `simtrack generate` made, with the format bop among its
+            writers.
+        minutes: Of computing time for each network, over all calls; if not given, until it has learned (the detector)
+            or 30 (an agent).
         seed: Of everything random.
         part: Both networks at once, a process each, or one of them.
     """
     import importlib.util
 
     from simtrack.cli import console
-    from simtrack.errors import StageError
+    from simtrack.errors import MissingValueError, StageError
+
+    if what == "agent":
+        return _train_agent(out, 30.0 if minutes is None else minutes, seed)
+    if data is None:
+        raise MissingValueError("--data", "the folder of a data set, which `simtrack generate` makes")
     from simtrack.training.detector import PARTS, TrainingConfig, prepared
 
     missing = [name for name in ("torch", "onnx") if importlib.util.find_spec(name) is None]
@@ -52,6 +61,34 @@ def train(
         console.show_error("stopped: the same command carries on from the last checkpoint")
         return 130
     console.show_written(out, [f"{name}.onnx" for name in parts])
+    return 0
+
+
+def _train_agent(out: Path, minutes: float, seed: int) -> int:
+    """Show each episode, and draw the curve of what was learned."""
+    from simtrack.cli import console
+    from simtrack.envs.learning import GazeTraining, LearnedEpisode
+    from simtrack.errors import InvalidValueError
+    from simtrack.report.learning import draw_learning
+
+    if not minutes > 0.0:
+        raise InvalidValueError("minutes", minutes, "a time above 0")
+    training = GazeTraining(out, seed)
+
+    def show(episode: LearnedEpisode) -> None:
+        print(
+            f"{episode.minutes:5.1f} min  {episode.steps} steps  episode {len(training.episodes)}: "
+            f"return {episode.total:.2f}, known {episode.known_share:.3f}",
+            flush=True,
+        )
+
+    try:
+        training.run(minutes, show)
+    except KeyboardInterrupt:
+        console.show_error("stopped: the same command carries on from the last checkpoint")
+        return 130
+    draw_learning([(e.minutes, e.total, e.known_share) for e in training.episodes], out / "learning.png")
+    console.show_written(out, ["gaze.npz", "learning.png"])
     return 0
 
 

@@ -6,6 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from simtrack.contracts import Float64
+from simtrack.envs.arm_kernels import (
+    DOWNWARDS,
+    FIXED,
+    LEVELLED,
+    POINTING,
+    PRISMATIC,
+    REVOLUTE,
+    TURNED,
+    solve,
+)
 from simtrack.geometry.kinematics import Joint, KinematicTree
 from simtrack.geometry.transforms import transform
 from simtrack.objects.tiago import GRIPPER, TORSO, TUCKED
@@ -25,6 +35,7 @@ LEVEL: Mapping[str, float] = {
 }  # fmt: skip
 """Posture before the chest with the cup pointing forward, the elbow up: the search begins here if the cup shall not
 point down."""
+KINDS = {"fixed": FIXED, "revolute": REVOLUTE, "prismatic": PRISMATIC}
 DOWN = np.array([0.0, 0.0, -1.0])
 RAISED: Mapping[str, float] = {**READY, "arm_2_joint": -1.08, "arm_4_joint": 1.1, "arm_6_joint": 1.3}
 """The same 11 cm higher, with the cup tilted by 15 degrees: things are carried over others."""
@@ -63,9 +74,17 @@ class ArmKinematics:
             name = links[name].parent
         self._tree = KinematicTree((links[name], *reversed(chain)))
         joints: dict[str, Joint] = {joint.name: joint for joint in self._tree.joints}
-        self._links = [next(link for link in chain if link.joint is joints[name]) for name in ARM]
-        self._low = np.array([joints[name].lower for name in ARM])
-        self._high = np.array([joints[name].upper for name in ARM])
+        self._limits = np.array([[joints[name].lower for name in ARM], [joints[name].upper for name in ARM]])
+        moved = self._tree.links[1:]
+        values = {name: number for number, name in enumerate((*ARM, TORSO))}
+        own = [link.joint for link in moved]
+        self._chain = (
+            np.array([link.T_parent_joint for link in moved]),
+            np.array([KINDS[joint.kind] if joint is not None else FIXED for joint in own], np.int32),
+            np.array([joint.axis if joint is not None else (0.0, 0.0, 1.0) for joint in own]),
+            np.array([values.get(joint.name, -1) if joint is not None else -1 for joint in own], np.int32),
+            transform(translation=(CUP[0], CUP[1], CUP[2])),
+        )
 
     def cup(self, joints: Mapping[str, float]) -> Float64:
         """(4, 4) T_base_cup: origin in the cup's rim, x in the direction of sucking."""
@@ -102,64 +121,14 @@ class ArmKinematics:
             q[0] = np.arctan2(position[1], position[0] - SHOULDER)
             wrist = 0.0 if yaw is None else q[0] + np.pi / 2 - yaw  # the cup's y axis points to the left in READY
             q[6] = np.arctan2(np.sin(wrist), np.cos(wrist))
-            q = np.clip(q, self._low, self._high)
-        home = q.copy()
-        for _ in range(config.iterations):
-            pose, J = self._linearised(q, torso)
-            if level and direction is not None:
-                error, close = self._pose_error(pose, position, direction)
-            else:
-                error, close = self._error(pose, position, yaw, DOWN if direction is None else direction)
-            if close:
-                return dict(zip(ARM, q.tolist(), strict=True))
-            if direction is not None and not level:  # turning about the cup's axis is free
-                J[3:] -= np.outer(direction, direction @ J[3:])
-            J = J[: len(error)]
-            JJ = J @ J.T + config.damping**2 * np.eye(len(J))
-            change = J.T @ np.linalg.solve(JJ, error)
-            free = np.eye(len(q)) - J.T @ np.linalg.solve(JJ, J)
-            change += config.posture * free @ (home - q)
-            change *= min(1.0, config.step / max(float(np.abs(change).max()), 1e-9))
-            q = np.clip(q + change, self._low, self._high)
-        return None
-
-    def _error(self, pose: Float64, position: Float64, yaw: float | None, direction: Float64) -> tuple[Float64, bool]:
-        """What is missing: metres, tilt, and, if asked for, turn about z instead of its z; and whether it is little."""
-        gap = position - pose[:3, 3]
-        axis = pose[:3, 0]
-        tilt = np.cross(axis, direction)
-        ahead = float(axis @ direction)
-        if ahead < 0.0:  # pointing the other way: any way round
-            tilt = tilt / max(float(np.linalg.norm(tilt)), 1e-6)
-        close = float(np.linalg.norm(gap)) < self.config.translation
-        close &= ahead > 0.0 and float(np.linalg.norm(tilt)) < self.config.tilt
-        if yaw is not None:
-            turn = yaw - float(np.arctan2(pose[1, 1], pose[0, 1]))
-            tilt[2] = float(np.arctan2(np.sin(turn), np.cos(turn)))
-            close &= abs(tilt[2]) < 2.0 * self.config.tilt
-        elif direction is DOWN:
-            tilt = tilt[:2]
-        return np.array([*gap, *tilt]), bool(close)
-
-    def _pose_error(self, pose: Float64, position: Float64, direction: Float64) -> tuple[Float64, bool]:
-        """What is missing to a pose that looks along a horizontal direction, z up: metres, rotation vector."""
-        wanted = np.stack([direction, [-direction[1], direction[0], 0.0], [0.0, 0.0, 1.0]], axis=1)
-        gap = position - pose[:3, 3]
-        turn = 0.5 * np.cross(pose[:3, :3].T, wanted.T).sum(axis=0)
-        if float(np.trace(pose[:3, :3].T @ wanted)) < 1.0:  # more than a right angle: any way round
-            turn = turn / max(float(np.linalg.norm(turn)), 1e-6)
-        near = float(np.linalg.norm(gap)) < self.config.translation
-        close = near and float(np.linalg.norm(turn)) < self.config.tilt and float(pose[:3, 0] @ direction) > 0.0
-        return np.array([*gap, *turn]), close
-
-    def _linearised(self, q: Float64, torso: float) -> tuple[Float64, Float64]:
-        """The cup's pose and its (6, 7) Jacobian: translation, then rotation, base frame."""
-        poses = self._tree.forward({TORSO: torso, **dict(zip(ARM, q.tolist(), strict=True))})
-        cup = poses[GRIPPER] @ transform(translation=(CUP[0], CUP[1], CUP[2]))
-        J = np.empty((6, len(q)))
-        for k, link in enumerate(self._links):
-            assert link.joint is not None
-            axis = poses[link.name][:3, :3] @ link.joint.axis
-            J[:3, k] = np.cross(axis, cup[:3, 3] - poses[link.name][:3, 3])
-            J[3:, k] = axis
-        return cup, J
+            q = np.clip(q, *self._limits)
+        if direction is None:
+            mode, direction = DOWNWARDS if yaw is None else TURNED, DOWN
+        else:
+            mode = LEVELLED if level else POINTING
+        settings = np.array([config.damping, config.translation, config.tilt, config.step, config.posture])
+        found, q = solve(
+            *self._chain, q, torso, self._limits, np.asarray(position, float), np.asarray(direction, float),
+            0.0 if yaw is None else yaw, mode, config.iterations, settings,
+        )  # fmt: skip
+        return dict(zip(ARM, q.tolist(), strict=True)) if found else None

@@ -158,14 +158,17 @@ class SimtrackEnv(gym.Env[Observation, Float32]):
         return self._loop
 
     def _restart(self, loop: "Loop") -> None:
-        """Draw a placement; one in some hundred does not come to rest where it should, and is drawn again."""
+        """Draw a placement; one that does not come to rest where it should, or cannot be played, is drawn again."""
         for last in [False] * (TRIES - 1) + [True]:
             try:
-                return loop.restart(int(self.np_random.integers(2**31)))
+                loop.restart(int(self.np_random.integers(2**31)))
             except FileFormatError:
                 if last:
                     raise
-        return None
+                continue
+            if self.task.playable(loop.simulation):
+                return
+        raise FileFormatError(self.scene.path, "robot.start", f"none of {TRIES} draws can be played; use another scene")
 
     def step(self, action: Float32) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for a tenth of a second.

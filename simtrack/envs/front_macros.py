@@ -21,6 +21,8 @@ from simtrack.objects.tiago import TORSO
 
 STEP, DEEPER = 0.008, 0.03
 """Metres that it comes nearer at a time, and beyond the believed face at which it gives up."""
+EARLY = 0.035
+"""Metres before a thing at which the cup cannot have met it yet."""
 SPEED = 0.10
 """m/s at which what is held moves."""
 LIFT, STROKE = 0.03, 0.22
@@ -146,13 +148,19 @@ def insert(m: Manipulator, place: Float64) -> Motion:
 def _touch(
     m: Manipulator, reach: FrontReach, place: Float64, direction: Float64, *, level: bool = False
 ) -> Generator[None, None, bool]:
-    """Approach a face until the cup has hold of something; returns whether it has."""
+    """Approach a face until the cup has hold of something; returns whether it has.
+
+    A `level` cup takes things: what it meets long before the thing is to come is something else, and is let go.
+    """
     for gap in np.arange(BEFORE - STEP, -DEEPER, -STEP).tolist():
         joints = reach.joints(place - gap * direction, direction, m.torso(), m.joints(), level)
         if joints is None:
             continue
         yield from m.go(joints)
         if m.cup.close() is not None:
+            if level and gap > EARLY:
+                m.cup.open()
+                return False
             return True
     return False
 

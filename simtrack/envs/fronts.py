@@ -23,6 +23,10 @@ SPACING = 0.02
 SEALING, LEANING = np.deg2rad(25.0), np.deg2rad(58.0)
 """Radians off a face's normal at which the cup finds hold, and up to which it may lean then."""
 LEANS = np.deg2rad([0, 12, -12, 25, -25, 40, -40, 58, -58])
+FACING = 0.9
+"""Cosine off a door's rough direction up to which its faces belong to its front."""
+FROM_RIM = 0.05
+"""Metres from the upper and lower end of a door or drawer within which it is not held if there is another place."""
 FROM_EDGE = 0.1
 """Metres from the outermost point at which a door is best moved: beside its handle."""
 COMFORT = 0.65
@@ -77,7 +81,14 @@ class Front:
             return a.axis
         arm = a.vertices.astype(float).mean(axis=0) - a.anchor
         out = np.asarray(np.cross(a.axis, arm - (arm @ a.axis) * a.axis), np.float64)
-        return out / float(np.linalg.norm(out))
+        out /= float(np.linalg.norm(out))
+        # The hinge lies behind the leaf, and a handle before it: the leaf's face tells better where it looks.
+        corners = a.vertices.astype(float)[a.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        facing = normals[normals @ out > FACING * np.linalg.norm(normals, axis=1)].sum(axis=0)
+        facing[2] = 0.0
+        length = float(np.linalg.norm(facing))
+        return facing / length if length > 0.0 else out
 
     @cached_property
     def outwards_closed(self) -> Float64:
@@ -95,6 +106,9 @@ class Front:
         a, spots = self.articulation, self.spots
         if not len(spots):
             return None
+        low, high = float(a.vertices[:, 2].min()) + FROM_RIM, float(a.vertices[:, 2].max()) - FROM_RIM
+        inner = (spots[:, 2] > low) & (spots[:, 2] < high)
+        spots = spots[inner] if inner.any() else spots
         cost = np.abs(spots[:, 2] - height)
         if a.kind == "revolute":
             along = np.cross(self.outwards, a.axis)

@@ -71,6 +71,10 @@ class Task(ABC):
     def prepare(self, simulation: "Simulation") -> None:  # noqa: B027
         """The world is built (once for many episodes): look up what `score` needs."""
 
+    def playable(self, simulation: "Simulation") -> bool:
+        """Whether an episode can begin with what was drawn for it; if not, it is drawn anew."""
+        return True
+
     def begin(self, simulation: "Simulation", rng: np.random.Generator) -> None:  # noqa: B027
         """An episode begins, at stamp 0; whatever is random about it is drawn from `rng`."""
 

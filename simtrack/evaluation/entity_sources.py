@@ -10,7 +10,7 @@ import numpy as np
 from simtrack.errors import InvalidValueError
 from simtrack.objects import ObjectModel
 from simtrack.perception.scene_graph.contact.nodes import EntityMesh, Finding
-from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
+from simtrack.simulation.building.rooms.plan import kind_of
 from simtrack.simulation.scene_file import SceneFile, load_scene
 
 LISTING = "entities.json"
@@ -87,7 +87,7 @@ def room_entities(scene: SceneFile, choice: EntityChoice, seed: int) -> SourceEn
     from simtrack.simulation.building.rooms.walk import partial_entities
 
     number = scene.static.seed if scene.static.seed is not None else seed
-    kind: RoomKind | None = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
+    kind = kind_of(scene.static.config)
     room = settled_room(number, kind)
     if choice == "true":
         meshes = tuple(EntityMesh(e.name, e.semantic_class, e.mesh) for e in room.entities)

@@ -12,7 +12,7 @@ from simtrack.errors import InvalidValueError
 from simtrack.perception.segmentation.panoptic import PanopticSegments, Segmenter
 from simtrack.simulation.building.rooms.film import FilmConfig, FilmFrame, RoomFilm
 from simtrack.simulation.building.rooms.physics import SettledRoom
-from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
+from simtrack.simulation.building.rooms.plan import RoomKind, kind_of
 from simtrack.simulation.oracles.segmenter import OracleSegmenter
 from simtrack.simulation.scene_file import load_scene
 
@@ -132,7 +132,7 @@ def map_source(
     if scene.static.builder != "room":
         raise InvalidValueError("source", source, "a furnished room such as rooms:7, or a folder of RGB-D images")
     number = scene.static.seed if scene.static.seed is not None else seed
-    kind: RoomKind | None = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
+    kind = kind_of(scene.static.config)
     made = room_source(number, kind, film, strength, seed, f"{scene.name}-{number}")
     if segmenter == "none":
         return MapSource(made.name, made.count, made.frames, NoSegmenter(), made.room, made.held)

@@ -103,6 +103,11 @@ def transform_planar(x: float, y: float, yaw: float) -> Float64:
     return transform(exp_so3(np.array([0.0, 0.0, yaw])), (x, y, 0.0))
 
 
+def wrapped(angle: float) -> float:
+    """The same angle between -pi and pi, radians."""
+    return float(np.arctan2(np.sin(angle), np.cos(angle)))
+
+
 def yaw_of(T: Float64) -> float:
     """Heading of the x axis about z, radians."""
     return float(np.arctan2(T[1, 0], T[0, 0]))

@@ -34,6 +34,8 @@ def test_a_detector_is_trained_by_one_command(tmp_path: Path, monkeypatch: pytes
             "minutes = 0.0 is not valid",
         ),
         (("evaluate", "detector"), "--data is required"),
+        (("train", "detector", "--out", "{tmp}/out"), "--data is required"),
+        (("train", "agent", "--out", "{tmp}/out", "--minutes", "0"), "minutes = 0.0 is not valid"),
         (("evaluate", "detector", "--data", "{tmp}", "--count", "0"), "count = 0 is not valid"),
         (("run", "--detector", "{tmp}"), "boxes.onnx: no such file"),
         (("run", "--detector", "{tmp}/mine.onnx"), "mine.onnx: no such file"),

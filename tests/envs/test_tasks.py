@@ -11,7 +11,7 @@ from simtrack.envs.environment import SimtrackEnv
 from simtrack.envs.task import Moment, Score, Task
 from simtrack.envs.tasks import make_task
 from simtrack.envs.truth import true_belief
-from simtrack.errors import InvalidValueError, UnknownNameError
+from simtrack.errors import FileFormatError, InvalidValueError, UnknownNameError
 from simtrack.geometry.transforms import difference, inverse
 
 Make = Callable[..., SimtrackEnv]
@@ -32,6 +32,16 @@ def test_a_task_of_ones_own(make: Make) -> None:
     env.reset(seed=0)
     ends = [env.step(STILL)[1:4] for _ in range(3)]
     assert ends == [(1.0, False, False), (1.0, False, False), (1.0, True, False)]
+
+
+def test_what_cannot_be_played_is_drawn_again_but_not_for_ever(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    env, answers = make(seconds=0.2), iter([False, True])
+    monkeypatch.setattr(env.task, "playable", lambda simulation: next(answers))
+    env.reset(seed=1)
+    assert next(answers, None) is None
+    monkeypatch.setattr(env.task, "playable", lambda simulation: False)
+    with pytest.raises(FileFormatError, match="can be played"):
+        env.reset(seed=1)
 
 
 def test_tasks_by_name_and_by_path() -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -91,13 +92,15 @@ SCRIPTED = {
 }
 """Task -> function that makes its scripted policy from (briefing, mode)."""
 POLICIES = ("random", "still", "scripted")
+LEARNED = "active-perception"
+"""Task that `simtrack train agent` learns."""
 
 
 def make_policy(name: str, task: str, briefing: Briefing, size: int, mode: str = "belief") -> Policy:
     """A policy by name.
 
     Args:
-        name: one of `POLICIES`.
+        name: one of `POLICIES`, or the folder in which `simtrack train agent` has left a network.
         task: name of the task; scripted policies are written for one.
         briefing: what it may know.
         size: of an action.
@@ -105,18 +108,25 @@ def make_policy(name: str, task: str, briefing: Briefing, size: int, mode: str =
 
     Raises:
         UnknownNameError: no such policy, or none was scripted for this task.
-        InvalidValueError: the mode is not observed.
+        InvalidValueError: the mode is not observed, or the network is for another task.
+        FileFormatError: the folder holds no network.
     """
-    if name not in POLICIES:
-        raise UnknownNameError("policy", name, POLICIES)
+    if name not in POLICIES and not Path(name).is_dir():
+        raise UnknownNameError("policy", name, (*POLICIES, "a folder of `simtrack train agent`"))
     if name == "random":
         return RandomPolicy(size)
     if name == "still":
         return StillPolicy(size)
-    if task not in SCRIPTED:
+    if name in POLICIES and task not in SCRIPTED:
         raise UnknownNameError("task with a scripted policy", task, SCRIPTED)
     if mode not in briefing.modes:
         raise InvalidValueError("observation", briefing.modes, f"modes among which is '{mode}', which the policy needs")
+    if name not in POLICIES:
+        from simtrack.envs.policies.gaze import GazePolicy
+
+        if task != LEARNED:
+            raise InvalidValueError("policy", name, f"a network for the task {task}; this one is for {LEARNED}")
+        return GazePolicy(briefing, mode, Path(name))
     module, _, function = SCRIPTED[task].partition(":")
     make: Callable[[Briefing, str], Policy] = getattr(import_module(module), function)
     return make(briefing, mode)

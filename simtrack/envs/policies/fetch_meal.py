@@ -1,30 +1,26 @@
 """Fetches a meal: opens what has to be open, takes the item, puts it in, closes. Sees beliefs and the survey only."""
 
 from collections.abc import Generator, Iterator
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from simtrack.contracts import NANOSECONDS, Articulation, Float32, Float64, JointEstimate, MapEntity, Track
-from simtrack.envs.actions import AXES, Outcome, Request, vector
+from simtrack.envs.actions import Outcome, Request
 from simtrack.envs.arm import ArmKinematics
 from simtrack.envs.front_macros import LIFT, STROKE
 from simtrack.envs.fronts import BEFORE, COMFORT, Front, FrontReach, followed, turned
-from simtrack.envs.observations import OUTCOMES, decode
 from simtrack.envs.planning import believed
 from simtrack.envs.policies import Briefing
-from simtrack.envs.settings import CONTROL_HZ
+from simtrack.envs.policies.driver import Driver, Plan, Tried
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import apply, inverse, transform_planar, yaw_of
-from simtrack.simulation.agents.floor_plan import FloorPlan
+from simtrack.geometry.transforms import apply, inverse, transform_planar
+from simtrack.perception.tracking.articulation import motion
 
-Plan: TypeAlias = Generator[Float32, None, None]
-"""Actions; each is answered by the next observation."""
-Tried: TypeAlias = Generator[Float32, None, bool]
-"""The same, and whether it worked."""
-
-FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad(82.0), np.deg2rad(72.0)
-"""Radians: far enough to reach in; a microwave's door is pushed shut again from the front."""
+FRIDGE_OPEN, MICROWAVE_OPEN = np.deg2rad([95.0, 88.0, 82.0, 75.0]), np.deg2rad([72.0])
+"""Radians, the first that the arm can do: far enough to reach in; a microwave's is pushed shut from the front."""
+ENOUGH = np.deg2rad(60.0)
+"""Radians from which on it is worth a try to reach into the fridge."""
 NEARLY = np.deg2rad(9.0)
 """Radians off the wanted position that do not matter."""
 SHUT = np.deg2rad(3.0)
@@ -37,24 +33,26 @@ TURNS = np.deg2rad([0, 15, -15, 30, -30, 45, -45])
 ASIDE = (0.0, 0.2, -0.2, 0.35, -0.35)
 AHEAD = (0.8, 0.75, 0.85, 0.7, 0.9, 0.65)
 """Where a thing may be from the base that the arm works on: radians off straight, metres to the left, ahead."""
+LIFTS = (0.3, 0.2)
+"""Metres of the torso with which doors are worked."""
 ROOM = 0.29
 """Metres around the middle of the base that must be free where it stands."""
-CAMERA_HEIGHT = 1.12
-"""Metres of the camera above the floor, with the torso down."""
 INTO = 0.075
 """Metres behind the edge of a board at which the middle of the item is put down."""
 HALF_WIDTH = 0.085
 """Metres to each side of the item's middle that must be free on its way: hand and item."""
 RUN_UP = 0.4
 """Metres before the place where something is inserted from which the robot drives straight."""
+ELSEWHERE = 0.08
+"""Metres from where something failed that are tried next."""
 TRIES = 3
 
 
-class FetchMealPolicy:
+class FetchMealPolicy(Driver):
     """Goes through the stages of the task; what fails is tried again from elsewhere."""
 
     def __init__(self, briefing: Briefing, mode: str) -> None:
-        self._briefing, self._mode = briefing, mode
+        super().__init__(briefing, mode)
         (self._goal,) = briefing.goals
         self._reach = FrontReach(ArmKinematics(briefing.robot))
         self._fridge = Front(_door(briefing, "fridge"))
@@ -64,56 +62,65 @@ class FetchMealPolicy:
 
     def begin(self, rng: np.random.Generator) -> None:
         """See `simtrack.envs.policies.Policy`."""
-        self._floor = FloorPlan(self._briefing.static_map)
-        self._gaze: Float64 | None = None
-        self._lift = 0.3
+        super().begin(rng)
+        self._failed: list[Float64] = []
         self._plan = self._fetch()
 
     def act(self, observation: Any) -> Float32:
         """See `simtrack.envs.policies.Policy`."""
-        arrays = self._briefing.arrays(observation, self._mode)
-        self._belief, _ = decode(arrays, self._briefing.layout, self._briefing.robot)
-        self._outcome = OUTCOMES[int(np.argmax(arrays["macro"]))]
-        self._holds = bool(arrays["holding"].any())
-        self._pan, self._tilt, self._torso = arrays["joints"].tolist()
+        self._sense(observation)
         return next(self._plan)
 
     # ----------------------------------------------------------------------------------------------------------- plans
 
     def _fetch(self) -> Plan:
+        put = False
         while True:
-            if not self._holds:
-                yield from self._open(self._microwave, MICROWAVE_OPEN)
-                yield from self._open(self._fridge, FRIDGE_OPEN, more=True)
+            if not (self._holds or put):
+                if not (yield from self._open(self._microwave, MICROWAVE_OPEN)):
+                    continue
+                if not (yield from self._open(self._fridge, FRIDGE_OPEN, more=True)):
+                    continue
                 yield from self._take()
             if self._holds:
                 yield from self._insert()
-            if not self._holds and self._is_in():
-                yield from self._open(self._microwave, 0.0)
+                put = not self._holds and self._is_in()
+            if put:
+                yield from self._open(self._microwave, np.zeros(1))
             yield self._move()
 
-    def _open(self, front: Front, angle: float, *, more: bool = False) -> Tried:
-        """Bring a door to an angle off its closed position; `more`: or beyond. Closes it with an angle of 0."""
-        a = front.articulation
-        wanted = min(a.lower + angle, a.upper)
-        for _ in range(TRIES):
+    def _open(self, front: Front, angles: Float64, *, more: bool = False) -> Tried:
+        """Bring a door to the first of some angles off its closed position that can be done; closes it with 0.
+
+        With `more`, any angle from the last of them on will do, and `ENOUGH` if no more can be done.
+        """
+        a, angle = front.articulation, float(angles[-1])
+        least = min(a.lower + angle, a.upper)
+        for attempt in range(TRIES + 1):
             yield from self._see(front)
             q = self._joint(a).position
             near = SHUT if angle == 0.0 else NEARLY
-            if abs(q - wanted) < near or (more and q > wanted):
+            if abs(q - least) < near or (more and q > least):
+                self._failed.clear()
                 return True
-            yield from self._raise(0.3)
-            spot = front.spot(COMFORT + 0.3)
-            stance = None if spot is None else self._door_stance(front, spot, q, wanted)
-            if spot is None or stance is None:
-                return False
-            yield from self._drive(stance)
-            yield from self._see(front, move=False)
-            q = self._joint(a).position
-            push = wanted if angle > 0.0 else a.lower - 0.03
-            yield from self._ask(Request("articulate", self._in_base(front.at(spot, q)[0]), push))
-            yield from self._straight(-0.1)
-        return False
+            targets = np.minimum(a.lower + angles[min(attempt, len(angles) - 1) :], a.upper).tolist()
+            found = self._door_plan(front, q, targets)
+            if found is None or attempt == TRIES:
+                break
+            spot, stance, wanted, lift = found
+            yield from self._raise(lift)
+            if (yield from self._drive(stance)):
+                yield from self._see(front, move=False)
+                q, here = self._joint(a).position, self._belief.localization.T_map_base
+                can = (w for w in targets if self._reach.follows(front, spot, (q, w), here, lift) is not None)
+                wanted = next(can, wanted)  # from where it has really come to stand
+                push = wanted if angle > 0.0 else a.lower - 0.03
+                yield from self._ask(Request("articulate", self._in_base(front.at(spot, q)[0]), push))
+                yield from self._straight(-0.1)
+            self._failed.append(stance[:2, 3])  # if it is tried again, then from elsewhere
+        self._failed.clear()
+        yield from self._wait(10)
+        return more and self._joint(a).position > a.lower + ENOUGH
 
     def _take(self) -> Tried:
         item = self._goal.subject
@@ -126,10 +133,12 @@ class FetchMealPolicy:
                 continue
             place = track.T_map_object[:3, 3]
             yield from self._raise(float(np.clip(place[2] - COMFORT, 0.0, 0.35)))
-            stance = self._stance(place, -self._fridge.outwards_closed, BEFORE, 0.0)
+            inwards = -self._fridge.outwards_closed
+            side = self._hinge_side(self._fridge)
+            stance = next((s for r in (RUN_UP, 0.0) if (s := self._stance(place, inwards, BEFORE, 0.0, r, side))), None)
             if stance is None:
                 return False
-            yield from self._drive(stance)
+            yield from self._come(*stance)
             yield from self._look_for(item, place)
             track = believed(self._belief, item)
             if track is not None:
@@ -137,6 +146,8 @@ class FetchMealPolicy:
             yield from self._straight(-0.4)
             if self._holds:
                 return True
+            if self._joint(self._fridge.articulation).position < self._fridge.articulation.lower + ENOUGH:
+                return False
         return False
 
     def _insert(self) -> Plan:
@@ -144,20 +155,23 @@ class FetchMealPolicy:
         yield from self._raise(float(np.clip(place[2] + 0.04 - COMFORT, 0.0, 0.35)))
         stance = self._stance(place - 0.03 * inwards, inwards, STROKE, LIFT, RUN_UP, side)
         if stance is None:
-            yield self._move()
+            yield from self._wait(10)
             return
-        before = stance.copy()  # with what is held stretched out, the last metre is driven straight
-        before[:2, 3] -= RUN_UP * stance[:2, 0]
         self._gaze = place
-        yield from self._drive(before)
-        yield from self._straight(RUN_UP)
+        yield from self._come(*stance)
         yield from self._wait(8)
         yield from self._ask(Request("insert", self._in_base(place)))
         yield from self._straight(-0.3)
+        yield from self._wait(5)
 
     def _is_in(self) -> bool:
+        """Whether the item may be in the microwave: nothing that was seen lately speaks against it."""
         track = believed(self._belief, self._goal.subject)
-        return self._outcome is Outcome.DONE or track is not None
+        if track is None or not self._fresh(track.last_seen):
+            return self._outcome is Outcome.DONE
+        T_map_board, size = self._board
+        x, y, z = apply(inverse(T_map_board), track.T_map_object[:3, 3][None])[0]
+        return bool(abs(x) < size[0] / 2 and abs(y) < size[1] / 2 and z > -0.02)
 
     # ------------------------------------------------------------------------------------------------- what is believed
 
@@ -184,7 +198,7 @@ class FetchMealPolicy:
         opened = self._joint(a).position - a.lower
         hinge = float(apply(inverse(T_map_board), a.anchor[None])[0][1])
         width = float(np.ptp((a.vertices - a.anchor) @ T_map_board[:3, 1]))
-        side = -float(np.sign(hinge))
+        side = self._hinge_side(self._microwave)
         tip = hinge + side * width * float(np.cos(opened))
         far = side * (size[1] / 2 - HALF_WIDTH)
         # From the leaf's tip to the far wall there has to be room for the hand.
@@ -192,6 +206,12 @@ class FetchMealPolicy:
         height = float(self._briefing.models[self._goal.subject].extents[2]) / 2
         local = np.array([size[0] / 2 - INTO, y, height])
         return apply(T_map_board, local[None])[0], -T_map_board[:3, 0], side
+
+    def _hinge_side(self, front: Front) -> float:
+        """1 if the hinge of a door is on the left of who looks at it, else -1."""
+        a, out = front.articulation, front.outwards_closed
+        leaf = apply(motion(a, a.lower), a.vertices.astype(float)).mean(axis=0)
+        return 1.0 if float(np.cross(out, leaf - a.anchor)[2]) > 0.0 else -1.0
 
     # --------------------------------------------------------------------------------------------------------- stances
 
@@ -206,17 +226,30 @@ class FetchMealPolicy:
                 for forward in AHEAD:
                     T = transform_planar(0.0, 0.0, float(np.arctan2(ahead[1], ahead[0])))
                     T[:2, 3] = place[:2] - (T[:3, :3] @ [forward, left, 0.0])[:2]
-                    if self._floor.clearance_at(*T[:2, 3].tolist()) > ROOM:
+                    tried = any(np.linalg.norm(T[:2, 3] - other) < ELSEWHERE for other in self._failed)
+                    if not tried and self._floor.clearance_at(*T[:2, 3].tolist()) > ROOM:
                         yield T
 
-    def _door_stance(self, front: Front, spot: Float64, position: float, wanted: float) -> Float64 | None:
+    def _door_plan(
+        self, front: Front, position: float, targets: list[float]
+    ) -> tuple[Float64, Float64, float, float] | None:
+        """Where a door is held, where the robot stands, to which of some positions, first the best, and the torso."""
+        for wanted in targets:
+            for lift in LIFTS:
+                spot = front.spot(COMFORT + lift)
+                stance = None if spot is None else self._door_stance(front, spot, position, wanted, lift)
+                if spot is not None and stance is not None:
+                    return spot, stance, wanted, lift
+        return None
+
+    def _door_stance(self, front: Front, spot: Float64, position: float, wanted: float, lift: float) -> Float64 | None:
         place, inwards = front.at(spot, position)
         best: tuple[float, Float64] | None = None
         for T in self._candidates(place, inwards):
             end = followed(front, spot, position, wanted, T)
             if self._floor.clearance_at(*end[:2, 3].tolist()) < ROOM:
                 continue
-            lean = self._reach.follows(front, spot, (position, wanted), T, self._lift)
+            lean = self._reach.follows(front, spot, (position, wanted), T, lift)
             if lean is not None and (best is None or lean < best[0]):
                 best = lean, T
             if best is not None and best[0] < np.deg2rad(59.0):
@@ -225,8 +258,11 @@ class FetchMealPolicy:
 
     def _stance(
         self, place: Float64, inwards: Float64, stroke: float, lift: float, run_up: float = 0.0, side: float = 0.0
-    ) -> Float64 | None:
-        """Where to stand so that a level cup goes straight to a place and has come from `stroke` metres before it."""
+    ) -> tuple[Float64, float] | None:
+        """Where to stand so that a level cup goes straight to a place and has come from `stroke` metres before it.
+
+        The robot drives straight for the last `run_up` metres, which are the second of what is returned.
+        """
         for T in self._candidates(place, inwards, side):
             behind = T[:2, 3] - run_up * T[:2, 0]
             if self._floor.clearance_at(*behind.tolist()) < ROOM:
@@ -237,7 +273,7 @@ class FetchMealPolicy:
             if inside is None:
                 continue
             if self._reach.joints(at - stroke * ahead, ahead, self._lift, level=True) is not None:
-                return T
+                return T, run_up
         return None
 
     # ------------------------------------------------------------------------------------------------------- movements
@@ -286,90 +322,6 @@ class FetchMealPolicy:
             yield self._move()
         return believed(self._belief, name)
 
-    def _drive(self, T_map_goal: Float64, near: float = 0.03) -> Tried:
-        """Drive to a pose: along a planned way, then straight there, then turn."""
-        goal, yaw = T_map_goal[:2, 3], yaw_of(T_map_goal)
-        path = self._floor.plan(self._belief.localization.T_map_base[:2, 3], goal)
-        way = [goal] if path is None else [*path[3:].tolist(), goal]
-        index = 0
-        for _ in range(300):
-            xy = self._belief.localization.T_map_base[:2, 3]
-            while index < len(way) - 1 and float(np.linalg.norm(way[index] - xy)) < 0.25:
-                index += 1
-            offset = np.asarray(way[index]) - xy
-            distance = float(np.linalg.norm(offset))
-            if index == len(way) - 1 and distance < near:
-                break
-            heading = yaw_of(self._belief.localization.T_map_base)
-            bearing = wrapped(float(np.arctan2(offset[1], offset[0])) - heading)
-            if index == len(way) - 1 and distance < 0.3 and abs(bearing) > np.pi / 2:  # it lies behind
-                bearing = wrapped(bearing + np.pi)
-                speed = 0.0 if abs(bearing) > 0.15 else -min(0.2, 0.6 * distance + 0.03)
-                yield self._move(linear=speed, angular=float(np.clip(1.8 * bearing, -0.6, 0.6)))
-                continue
-            left = float(np.linalg.norm(goal - xy))
-            speed = 0.0 if abs(bearing) > 0.35 else min(0.45, 0.8 * left + 0.03)
-            yield self._move(linear=speed, angular=float(np.clip(1.8 * bearing, -0.8, 0.8)))
-        for _ in range(120):
-            gap = wrapped(yaw - yaw_of(self._belief.localization.T_map_base))
-            if abs(gap) < 0.02:
-                break
-            yield self._move(angular=float(np.clip(1.6 * gap, -0.7, 0.7) + 0.02 * np.sign(gap)))
-        yield from self._wait(4)
-        return float(np.linalg.norm(self._belief.localization.T_map_base[:2, 3] - goal)) < 0.1
-
-    def _straight(self, distance: float) -> Plan:
-        """Go straight ahead, or back if negative."""
-        begin = self._belief.localization.T_map_base[:2, 3].copy()
-        for _ in range(60):
-            left = abs(distance) - float(np.linalg.norm(self._belief.localization.T_map_base[:2, 3] - begin))
-            if left < 0.02:
-                break
-            yield self._move(linear=float(np.sign(distance)) * min(0.25, left + 0.05))
-        yield from self._wait(3)
-
-    def _raise(self, lift: float) -> Plan:
-        """Bring the torso to a height."""
-        self._lift = lift
-        for _ in range(60):
-            if abs(self._torso - lift) < 0.003:
-                break
-            yield self._move()
-
-    def _wait(self, steps: int) -> Plan:
-        for _ in range(steps):
-            yield self._move()
-
-    def _ask(self, request: Request) -> Plan:
-        """Until the arm has done it, or has said why not."""
-        yield request.action(self._briefing.layout.macros)
-        while self._outcome is Outcome.BUSY:
-            yield self._move()
-
-    def _move(self, linear: float = 0.0, angular: float = 0.0) -> Float32:
-        """An action that drives, and looks where the policy looks."""
-        pan, tilt = self._towards()
-        speeds = {
-            "linear": linear / AXES["linear"],
-            "angular": angular / AXES["angular"],
-            "pan": (pan - self._pan) * CONTROL_HZ / AXES["pan"] / 2.0,
-            "tilt": (tilt - self._tilt) * CONTROL_HZ / AXES["tilt"] / 2.0,
-            "torso": (self._lift - self._torso) * CONTROL_HZ / AXES["torso"] / 2.0,
-        }
-        return np.clip(vector(speeds, self._briefing.layout.macros), -1.0, 1.0)
-
-    def _towards(self) -> tuple[float, float]:
-        """Angles of the head that look at the place that is gazed at."""
-        if self._gaze is None:
-            return 0.0, -0.4
-        x, y, z = self._in_base(self._gaze)
-        pan = float(np.clip(np.arctan2(y, x), -1.1, 1.1))
-        rise = z - (CAMERA_HEIGHT + self._torso)
-        return pan, float(np.clip(np.arctan2(rise, max(np.hypot(x, y), 0.2)), -0.9, 0.4))
-
-    def _in_base(self, place: Float64) -> Float64:
-        return apply(inverse(self._belief.localization.T_map_base), place[None])[0]
-
 
 def _door(briefing: Briefing, name: str) -> Articulation:
     """The largest door of a piece of furniture, by its name or class.
@@ -399,8 +351,3 @@ def _board(briefing: Briefing, name: str, front: Front) -> tuple[Float64, Float6
     T[:3, :3] = np.stack([out, np.cross([0.0, 0.0, 1.0], out), [0.0, 0.0, 1.0]], axis=1)
     T[:3, 3] = T_map_face[:3, 3]
     return T, np.asarray(size)[::-1] if abs(local[1]) > abs(local[0]) else np.asarray(size)
-
-
-def wrapped(angle: float) -> float:
-    """The same angle between -pi and pi, radians."""
-    return float(np.arctan2(np.sin(angle), np.cos(angle)))

@@ -13,7 +13,7 @@ from simtrack.envs.observations import OUTCOMES, decode
 from simtrack.envs.planning import Places, Reach, Spot, believed
 from simtrack.envs.policies import Briefing
 from simtrack.envs.settings import CONTROL_HZ
-from simtrack.geometry.transforms import apply, inverse, yaw_of
+from simtrack.geometry.transforms import apply, inverse, wrapped, yaw_of
 
 Plan: TypeAlias = Generator[Float32, None, None]
 """Actions; each is answered by the next observation."""
@@ -221,8 +221,3 @@ class TidyPolicy:
 
     def _in_base(self, place: Float64) -> Float64:
         return apply(inverse(self._belief.localization.T_map_base), place[None])[0]
-
-
-def wrapped(angle: float) -> float:
-    """The same angle between -pi and pi, radians."""
-    return float(np.arctan2(np.sin(angle), np.cos(angle)))

@@ -10,6 +10,7 @@ from simtrack.envs.task import Moment, Score, Task
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import apply, exp_so3, inverse
 from simtrack.objects import load_object
+from simtrack.simulation.agents.floor_plan import FloorPlan
 from simtrack.simulation.building.parts import MovingPart, StaticPart, StaticWorld
 from simtrack.simulation.mjcf_world import free_bodies, level_faces, mjcf_building, mjcf_scene
 from simtrack.simulation.scene_file import SceneFile, parse_scene
@@ -23,7 +24,7 @@ OPENED = np.deg2rad(60.0)
 """Radians from which on the fridge counts as opened."""
 CLOSED = np.deg2rad(4.0)
 """Radians up to which the microwave counts as closed."""
-SHELF_HEIGHTS, CAVITY_HEIGHTS = (0.55, 1.02), (0.7, 1.06)
+SHELF_HEIGHTS, CAVITY_HEIGHTS = (0.55, 1.03), (0.7, 1.06)
 """Metres above the floor within which the arm works from the front: boards of fridges, floors of microwaves."""
 HEADROOM = 0.2
 """Metres of free height above a board."""
@@ -31,6 +32,8 @@ DEPTH = (0.05, 0.10)
 """Metres from a board's front edge to the middle of the item."""
 ASIDE, TURN = 0.06, 0.15
 """Metres off the middle of the board, and radians off the direction to its front, at most."""
+BEFORE = 1.0
+"""Metres before the middle of a board to which there has to be a way."""
 AT_REST = 0.05
 """m/s."""
 WORTH = {"opened": 1.0, "taken": 1.0, "inside": 1.0, "closed": 2.0}
@@ -61,7 +64,7 @@ class FetchMeal(Task):
     """
 
     script = "fetch-meal"
-    scene = "kitchen:0"
+    scene = "open_kitchen:0"
     seconds = 240.0
     macros = ("articulate", "take", "insert")
 
@@ -73,12 +76,13 @@ class FetchMeal(Task):
         """
         if scene.static.builder == "room":
             from simtrack.simulation.building.rooms.functional import functional_room
-            from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
+            from simtrack.simulation.building.rooms.plan import kind_of
 
-            kind: RoomKind | None = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
-            scene = mjcf_scene(functional_room(scene.static.seed or 0, kind))
+            scene = mjcf_scene(functional_room(scene.static.seed or 0, kind_of(scene.static.config)))
         if scene.static.builder != "mjcf":
-            raise InvalidValueError("scene", scene.name, "a kitchen (kitchen:SEED), or an MJCF file of one")
+            raise InvalidValueError(
+                "scene", scene.name, "a kitchen (open_kitchen:SEED, kitchen:SEED), or an MJCF file of one"
+            )
         world = mjcf_building(scene, supports=False)
         fridge = appliance(world, "fridge", SHELF_HEIGHTS, scene)
         microwave = appliance(world, "microwave", CAVITY_HEIGHTS, scene)
@@ -88,7 +92,7 @@ class FetchMeal(Task):
         document = scene.model_dump(mode="json", exclude_defaults=True)
         document["objects"] = [{"model": ITEM, "name": ITEM, "place": place}]
         document["robot"] = {"start": {"room": "room"}, "torso": 0.3, "head_tilt": -0.4, "suction": True}
-        self._inside = microwave
+        self._kept, self._inside = fridge, microwave
         return parse_scene(document, scene.path)
 
     def begin(self, simulation: "Simulation", rng: np.random.Generator) -> None:
@@ -122,9 +126,16 @@ class FetchMeal(Task):
         return Score(reward, closed, terminated=closed, metrics=metrics)
 
     def prepare(self, simulation: "Simulation") -> None:
-        """Look up where the fridge is closed."""
+        """Look up where the fridge is closed and where one can drive."""
         doors = {moving.part.name: moving for moving in simulation.world.static.moving}
         self._fridge_closed = doors[self.fridge].lower
+        self._floor = FloorPlan(simulation.static_map)
+
+    def playable(self, simulation: "Simulation") -> bool:
+        """Whether there is a way from the start to both appliances."""
+        start = simulation.start[:2, 3]
+        fronts = (T[:2, 3] + BEFORE * T[:2, 0] for T in (self._kept.T_map_board, self._inside.T_map_board))
+        return self._floor.free(*start.tolist()) and all(self._floor.plan(start, front) is not None for front in fronts)
 
     def _contains(self, place: Float64) -> bool:
         """Whether the middle of something is inside of the microwave, above its board."""

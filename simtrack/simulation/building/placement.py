@@ -97,6 +97,31 @@ class FloorSpace:
         self.free = remaining
         return True
 
+    def keep_clear(self, x: float, y: float, yaw: float, depth: float, width: float) -> bool:
+        """Keep the floor of a rectangle clear and joined to the doors, if nothing stands on it; says whether it does.
+
+        Args:
+            x: of its middle, metres, as `y`.
+            y: of its middle.
+            yaw: direction of its depth, radians.
+            depth: metres.
+            width: metres.
+        """
+        window, wanted = self._window(x, y, yaw, depth, width)
+        cell = (np.array([x, y]) - self.origin) / CELL
+        landing = (int(cell[0]), int(cell[1]))
+        # a rectangle that sticks out of the grid has fewer cells than its area
+        if np.count_nonzero(wanted) < 0.95 * depth * width / CELL**2 or not self.free[window][wanted].all():
+            return False
+        self.landings.append(landing)
+        ways = self._ways(self.free)
+        if ways < 0:
+            self.landings.pop()
+            return False
+        self.reserved[window] |= wanted
+        self.ways = ways
+        return True
+
     def put_at_wall(
         self,
         piece: Piece,

@@ -24,6 +24,10 @@ LEAN = (np.radians(9.0), np.radians(15.0))
 """Radians off the vertical of what leans."""
 AJAR = 0.35
 """Share of a joint's range from which one can look and reach into what it closes."""
+SERVICE = (1.3, 1.7)
+"""Metres, depth and width, of clear floor before what a robot is to work at."""
+AMID = 0.2
+"""Metres off the middle of what it stands on, at most, of what a robot is to work at."""
 OPENS = 0.45
 """Chance of a joint to be open."""
 
@@ -121,6 +125,51 @@ class Furnisher:
             x, y, heading = found
             T = _standing(model, x, y, heading + np.pi / 2, 0.0)
             self.add(name, model, T, self._opened(model, T))
+
+    def served(self, family: str, on_top: str | None = None) -> None:
+        """Put a closed thing to a wall and keep the floor before it clear; stand another one at its front edge."""
+        name, model = self.make(family)
+        depth, width = model.extents[[1, 0]].tolist()
+        clear = SERVICE[0], max(width, SERVICE[1])
+        footprint, heading = _Footprint(model.extents[[1, 0, 2]]), 0.0
+        for _ in range(60):
+            before = self.space.free.copy(), self.space.ways
+            found = self.space.put_at_wall(footprint, self.rng, attempts=60)
+            if found is None:
+                return
+            x, y, heading = found
+            front = np.array([np.cos(heading), np.sin(heading)])
+            middle = np.array([x, y]) + front * (depth / 2 + clear[0] / 2 + 0.06)
+            ahead, aside = middle.tolist()
+            if self.space.keep_clear(ahead, aside, heading, clear[0], clear[1]):
+                T = _standing(model, x, y, heading + np.pi / 2, 0.0)
+                known = len(self.faces)
+                self.add(name, model, T, {})
+                half = np.full(2, clear[0] / 2)
+                self.bounds.append(np.array([[*(middle - half), 0.0], [*(middle + half), 1.8]]))
+                if on_top is not None:
+                    self._at_front_edge(on_top, max(self.faces[known:], key=lambda face: float(face.T_map_face[2, 3])))
+                return
+            self.space.free, self.space.ways = before
+
+    def _at_front_edge(self, family: str, face: _Face) -> None:
+        """Stand a closed thing at the front edge of a face, turned to it."""
+        name, model = self.make(family)
+        turn = float(np.clip(self.rng.normal(0.0, 0.04), -0.1, 0.1))
+        turning = np.abs([[np.cos(turn), np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        half = turning @ model.extents[:2] / 2
+        free = face.size / 2 - half - 0.012
+        at = np.array(
+            [
+                self.rng.uniform(*np.clip([-free[0], free[0]], -AMID, AMID)),
+                self.rng.uniform(-free[1], min(0.05 - free[1], free[1])),
+            ]
+        )
+        face.taken.append((at, half + (0.08, 0.0)))
+        face.taken.append((np.array([at[0], -face.size[1] / 2]), np.array([half[0] + 0.08, 0.1])))
+        T = face.T_map_face @ transform_planar(float(at[0]), float(at[1]), turn)
+        yaw = float(np.arctan2(T[1, 0], T[0, 0]))
+        self.add(name, model, _standing(model, float(T[0, 3]), float(T[1, 3]), yaw, float(T[2, 3])), {})
 
     def against_wall(self, family: str) -> None:
         """Try to lean a thing against a wall: its rear side's upper edge touches it, its lower edge stands off."""

@@ -1,7 +1,8 @@
 """A room from a seed: its kind, its shell, and what stands, hangs and leans where, before physics has settled it."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -11,31 +12,43 @@ from simtrack.simulation.building.rooms.fittings import Cleat
 from simtrack.simulation.building.rooms.furnisher import Furnisher, PlacedModel
 from simtrack.simulation.building.shell import GLASS, Opening, room_shell
 
-RoomKind: TypeAlias = Literal["bedroom", "living", "study", "kitchen"]
+RoomKind: TypeAlias = Literal["bedroom", "living", "study", "kitchen", "open-kitchen"]
 KINDS: tuple[RoomKind, ...] = ("bedroom", "living", "study", "kitchen")
+"""Those that are drawn from a seed."""
+ALL_KINDS: tuple[RoomKind, ...] = (*KINDS, "open-kitchen")
+"""Those that can be asked for; in an ``open-kitchen`` the floor before fridge and microwave is kept clear,
+and nothing lies or leans about on it that no survey would show."""
+SERVED: dict[RoomKind, tuple[tuple[str, str | None], ...]] = {
+    "open-kitchen": (("fridge", None), ("counter", "microwave"))
+}
+"""What stands against walls with clear floor before it, and what stands on it, all of it closed."""
 AT_WALL: dict[RoomKind, tuple[str, ...]] = {
     "bedroom": ("bed", "cabinet", "cabinet", "table", "board"),
     "living": ("sofa", "cabinet", "cabinet", "table", "board"),
     "study": ("table", "cabinet", "cabinet", "fridge", "board"),
     "kitchen": ("counter", "counter", "fridge", "cabinet", "board"),
+    "open-kitchen": ("counter", "cabinet"),
 }
 IN_THE_OPEN: dict[RoomKind, tuple[str, ...]] = {
     "bedroom": ("chair", "bag", "plant", "box"),
     "living": ("table", "chair", "chair", "plant", "bag"),
     "study": ("table", "chair", "chair", "bag", "plant", "box"),
     "kitchen": ("table", "chair", "chair", "chair", "plant", "bag"),
+    "open-kitchen": ("table", "chair", "chair"),
 }
 ON_WALLS: dict[RoomKind, tuple[str, ...]] = {
     "bedroom": ("shelf", "picture", "picture"),
     "living": ("picture", "shelf", "picture"),
     "study": ("shelf", "picture", "wall cabinet"),
     "kitchen": ("wall cabinet", "wall cabinet", "picture"),
+    "open-kitchen": ("wall cabinet", "picture"),
 }
 ON_TOP: dict[RoomKind, tuple[str, ...]] = {
     "bedroom": ("monitor", "book", "book", "cup", "cup", "box", "plant", "bottle", "bag", "bowl", "keyboard"),
     "living": ("monitor", "book", "bowl", "cup", "bottle", "plant", "box", "book", "cup", "bowl", "bottle"),
     "study": ("monitor", "keyboard", "monitor", "book", "book", "cup", "bottle", "box", "plant", "keyboard"),
     "kitchen": ("microwave", "bowl", "bowl", "cup", "cup", "bottle", "bottle", "box", "plant", "cup", "book"),
+    "open-kitchen": ("bowl", "bowl", "cup", "cup", "bottle", "bottle", "box", "plant", "cup", "book"),
 }
 INSIDE = ("cup", "bowl", "bottle", "book", "cup")
 
@@ -51,6 +64,11 @@ class RoomPlan:
     placed: tuple[PlacedModel, ...]
     cleats: tuple[Cleat, ...]
     """What things hang on; parts of the walls."""
+
+
+def kind_of(config: Mapping[str, Any]) -> RoomKind | None:
+    """The kind that the configuration of a scene's room names; None if it is drawn from the seed."""
+    return next((kind for kind in ALL_KINDS if kind == config.get("kind")), None)
 
 
 def plan_room(seed: int, kind: RoomKind | None = None) -> RoomPlan:
@@ -81,6 +99,8 @@ def plan_room(seed: int, kind: RoomKind | None = None) -> RoomPlan:
 
 def _furnish(maker: Furnisher, kind: RoomKind) -> None:
     """Furniture first, then what hangs, then what stands on, leans on and lies in all that."""
+    for name, on_top in SERVED.get(kind, ()):
+        maker.served(name, on_top)
     for name in AT_WALL[kind]:
         if name == "board":
             maker.against_wall(name)

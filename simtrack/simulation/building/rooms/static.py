@@ -12,7 +12,7 @@ from simtrack.geometry.transforms import inverse, transform
 from simtrack.simulation.building.parts import StaticPart, StaticWorld, Support
 from simtrack.simulation.building.rooms.fittings import Cleat
 from simtrack.simulation.building.rooms.physics import RoomEntity, settled_room
-from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
+from simtrack.simulation.building.rooms.plan import ALL_KINDS, RoomKind
 
 SMALL = 0.6
 """Metres: what is smaller along all sides is clutter and too small for a survey."""
@@ -23,11 +23,11 @@ class RoomConfig:
     """Which room is built."""
 
     kind: RoomKind | Literal["any"] = "any"
-    """One of `KINDS`, or ``any``: drawn from the seed."""
+    """One of `ALL_KINDS`, or ``any``: drawn from the seed."""
 
     def __post_init__(self) -> None:
-        if self.kind not in (*KINDS, "any"):
-            raise InvalidValueError("RoomConfig.kind", self.kind, f"any, {', '.join(KINDS)}")
+        if self.kind not in (*ALL_KINDS, "any"):
+            raise InvalidValueError("RoomConfig.kind", self.kind, f"any, {', '.join(ALL_KINDS)}")
 
 
 def room_world(seed: int, config: RoomConfig | None = None) -> StaticWorld:

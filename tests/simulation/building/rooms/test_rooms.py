@@ -121,3 +121,26 @@ def test_a_walk_sees_parts_of_the_surface_near_where_it_is() -> None:
 def test_evaluation_rooms_are_twenty_seeds() -> None:
     rooms = evaluation_rooms()
     assert len(rooms) == len(set(rooms)) == 20
+
+
+@pytest.mark.parametrize("seed", [3, 12])
+def test_in_an_open_kitchen_fridge_and_microwave_are_closed_with_clear_floor_before_them(seed: int) -> None:
+    things = {thing.name: thing for thing in plan_room(seed, "open-kitchen").placed}
+    microwave = things["microwave1"]
+    assert "fridge1" in things and not things["fridge1"].positions and not microwave.positions
+    bearer = min(
+        (thing for name, thing in things.items() if name.startswith("cabinet")),
+        key=lambda thing: np.linalg.norm(thing.T_map_model[:2, 3] - microwave.T_map_model[:2, 3]),
+    )
+    assert 0.6 < microwave.T_map_model[2, 3] < 1.2
+    for front in (things["fridge1"], bearer):
+        half = front.model.extents / 2
+        for name, thing in things.items():
+            if name not in (front.name, "microwave1"):
+                vertices = thing.model.mesh(thing.positions).vertices
+                ahead = apply(inverse(front.T_map_model) @ thing.T_map_model, vertices)
+                standing = apply(thing.T_map_model, vertices)[:, 2] < 1.3
+                near = (
+                    (np.abs(ahead[:, 0]) < half[0]) & (ahead[:, 1] < -half[1] - 0.05) & (ahead[:, 1] > -half[1] - 1.2)
+                )
+                assert not (near & standing).any(), name
