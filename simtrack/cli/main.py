@@ -23,6 +23,7 @@ from simtrack.cli.replay import replay
 from simtrack.cli.run import run
 from simtrack.cli.scenes import scenes
 from simtrack.cli.score import score
+from simtrack.cli.serve import serve
 from simtrack.cli.sweep import sweep
 from simtrack.cli.train import train
 from simtrack.cli.trials import trials
@@ -42,6 +43,7 @@ VERBS = {
     "validate": validate,
     "train": train,
     "map": map_command,
+    "serve": serve,
     "reconstruct": reconstruct,
     "check": check,
     "scenes": scenes,

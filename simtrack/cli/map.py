@@ -12,7 +12,7 @@ FOLDERS = ("entities",)
 def map_command(
     source: Annotated[str, tyro.conf.Positional],
     out: Path | None = None,
-    segmenter: Literal["oracle", "none"] | None = None,
+    segmenter: str | None = None,
     strength: float = 1.0,
     voxel: float = 0.02,
     method: Literal["full", "no-joint-fusion", "voxbloxpp"] = "full",
@@ -26,8 +26,9 @@ def map_command(
     Args:
         source: A furnished room such as rooms:7 or kitchen:2, which is filmed, or a recording with poses.
         out: Folder for the results; runs/map-SOURCE if not given.
-        segmenter: Who segments the images: an oracle with a network's errors, the default for rooms, or none, the
-            default for recordings: geometry alone is mapped.
+        segmenter: Who segments the images: oracle (knows the truth, and errs like a network), the default for rooms;
+            none, the default for recordings: geometry alone is mapped; learned (the network that comes along), a folder
+            that `simtrack train segmenter` wrote, a service at http://HOST:PORT, or package.module:Class.
         strength: Of the oracle's errors, 0 to 3; 1 is fixed so that the map without joint fusion is as good as the
             reconstruction paper's.
         voxel: Metres.
@@ -68,5 +69,7 @@ def map_command(
     console.show_table(("figure", "value"), rows, right=(1,))
     for reason, count in sorted(mapped.map.skipped.items()):
         print(f"{count} frames were skipped: {reason}")
+    for reason, count in sorted(given.failures.items()):
+        print(f"the segmenter failed on {count} frames: {reason}")
     console.show_written(folder, FILES)
     return 0

@@ -1,20 +1,23 @@
 """What a panoptic map is made from: a room that is filmed, or a recording of an RGB-D camera."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from simtrack.contracts import Float64, Int32, RgbdFrame
 from simtrack.errors import InvalidValueError
+from simtrack.perception.segmentation.loading import make_segmenter
 from simtrack.perception.segmentation.panoptic import PanopticSegments, Segmenter
 from simtrack.simulation.building.rooms.film import FilmConfig, FilmFrame, RoomFilm
 from simtrack.simulation.building.rooms.physics import SettledRoom
 from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
 from simtrack.simulation.oracles.segmenter import OracleSegmenter
 from simtrack.simulation.scene_file import load_scene
+
+ORACLE, NONE = "oracle", "none"
 
 
 class NoSegmenter:
@@ -69,6 +72,11 @@ class MapSource:
     held: AbstractContextManager[object] = field(default_factory=nullcontext)
     """What must be released afterwards."""
 
+    @property
+    def failures(self) -> Mapping[str, int]:
+        """Why a segmentation service failed, and on how many frames."""
+        return getattr(self.segmenter, "failures", {})
+
 
 def room_source(
     seed: int,
@@ -111,7 +119,8 @@ def map_source(
 
     Args:
         source: a furnished room (``rooms:7``), or a recording of an RGB-D camera with poses.
-        segmenter: ``oracle`` or ``none``; if None, the oracle for rooms and none for recordings.
+        segmenter: ``oracle``, ``none``, or what `simtrack.perception.segmentation.loading.make_segmenter` takes; if
+            None, the oracle for rooms and none for recordings.
         film: how a room is filmed; of a recording, the first `FilmConfig.frames` frames are taken.
         strength: of the oracle's errors.
         seed: of a scene whose name fixes none, of the walk and of the errors.
@@ -119,27 +128,29 @@ def map_source(
     Raises:
         UnknownNameError: no such scene.
         FileFormatError: a recording that is none.
-        InvalidValueError: it is no room or has no poses, or no such segmenter.
+        InvalidValueError: it is no room or has no poses, or the oracle is asked about a recording.
+        StageError: no such segmenter, or its service does not answer.
     """
-    if segmenter not in (None, "oracle", "none"):
-        raise InvalidValueError("segmenter", segmenter, "oracle, none")
     path, film = Path(source), film or FilmConfig()
     if path.exists() and not (path / "scene.yaml").is_file() and path.suffix not in (".yaml", ".yml", ".xml"):
-        if segmenter == "oracle":
-            raise InvalidValueError("segmenter", segmenter, f"none: nobody knows what {source} truly shows")
-        return _recording(path, film)
+        if segmenter == ORACLE:
+            raise InvalidValueError("segmenter", segmenter, f"another: nobody knows what {source} truly shows")
+        return _recording(path, film, _segmenter(segmenter or NONE))
     scene = load_scene(source)
     if scene.static.builder != "room":
         raise InvalidValueError("source", source, "a furnished room such as rooms:7, or a folder of RGB-D images")
     number = scene.static.seed if scene.static.seed is not None else seed
     kind: RoomKind | None = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
+    chosen = None if segmenter in (None, ORACLE) else _segmenter(segmenter)  # before a room is built
     made = room_source(number, kind, film, strength, seed, f"{scene.name}-{number}")
-    if segmenter == "none":
-        return MapSource(made.name, made.count, made.frames, NoSegmenter(), made.room, made.held)
-    return made
+    return made if chosen is None else replace(made, segmenter=chosen)
 
 
-def _recording(path: Path, film: FilmConfig) -> MapSource:
+def _segmenter(given: str) -> Segmenter:
+    return NoSegmenter() if given == NONE else make_segmenter(given)
+
+
+def _recording(path: Path, film: FilmConfig, segmenter: Segmenter) -> MapSource:
     from itertools import islice
 
     from simtrack.recordings.source import open_log
@@ -154,4 +165,4 @@ def _recording(path: Path, film: FilmConfig) -> MapSource:
             if isinstance(entry.frame, RgbdFrame):
                 yield MapFrame(entry.frame, entry.T_map_sensor)
 
-    return MapSource(path.resolve().name, count, frames, NoSegmenter())
+    return MapSource(path.resolve().name, count, frames, segmenter)
