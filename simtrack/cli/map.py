@@ -13,6 +13,7 @@ def map_command(
     source: Annotated[str, tyro.conf.Positional],
     out: Path | None = None,
     segmenter: str | None = None,
+    poses: Literal["true", "estimated", "noisy"] = "true",
     strength: float = 1.0,
     voxel: float = 0.02,
     method: Literal["full", "no-joint-fusion", "voxbloxpp"] = "full",
@@ -29,6 +30,8 @@ def map_command(
         segmenter: Who segments the images: oracle (knows the truth, and errs like a network), the default for rooms;
             none, the default for recordings: geometry alone is mapped; learned (the network that comes along), a folder
             that `simtrack train segmenter` wrote, a service at http://HOST:PORT, or package.module:Class.
+        poses: Of the camera: true, as the film or the recording states them; estimated, by RGB-D odometry from the
+            images alone; noisy, the stated ones with the errors of a SLAM system.
         strength: Of the oracle's errors, 0 to 3; 1 is fixed so that the map without joint fusion is as good as the
             reconstruction paper's.
         voxel: Metres.
@@ -56,7 +59,7 @@ def map_command(
         console.ProgressLine(f"map {source}", "looking at the source", to_stderr=True) as line,
         new_folder(folder, overwrite, FILES, FOLDERS) as work,
     ):
-        given = map_source(source, segmenter, film, strength, seed)
+        given = map_source(source, segmenter, film, strength, seed, poses)
         mapped = map_scene(given, config, lambda k, n: line.show(f"frame {k} of {n}", k / n))
         line.say("comparing with the truth" if mapped.seen is not None else "measuring")
         metrics = scene_metrics(mapped)

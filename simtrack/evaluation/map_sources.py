@@ -4,20 +4,24 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from simtrack.contracts import Float64, Int32, RgbdFrame
 from simtrack.errors import InvalidValueError
+from simtrack.perception.mapping.odometry.rgbd_odometry import RgbdOdometry
 from simtrack.perception.segmentation.loading import make_segmenter
 from simtrack.perception.segmentation.panoptic import PanopticSegments, Segmenter
 from simtrack.simulation.building.rooms.film import FilmConfig, FilmFrame, RoomFilm
 from simtrack.simulation.building.rooms.physics import SettledRoom
 from simtrack.simulation.building.rooms.plan import KINDS, RoomKind
+from simtrack.simulation.oracles.camera_poses import NoisyPoses
 from simtrack.simulation.oracles.segmenter import OracleSegmenter
 from simtrack.simulation.scene_file import load_scene
 
 ORACLE, NONE = "oracle", "none"
+Poses: TypeAlias = Literal["true", "estimated", "noisy"]
 
 
 class NoSegmenter:
@@ -112,8 +116,42 @@ def room_source(
     return MapSource(name or f"rooms-{seed}", len(shot), frames, oracle, room, shot)
 
 
+def with_poses(source: MapSource, poses: Poses, seed: int = 0) -> MapSource:
+    """A source whose camera poses are estimated.
+
+    The map's frame is fixed to the first pose that the source states; it is the origin if it states none.
+
+    Args:
+        source: of the frames.
+        poses: ``true`` as the source states them; ``estimated`` by RGB-D odometry from the images alone; ``noisy``, the
+            stated ones with the errors of a SLAM system.
+        seed: of those errors.
+    """
+    if poses == "true":
+        return source
+
+    def estimated() -> Iterator[MapFrame]:
+        odometry: RgbdOdometry | None = None
+        for entry in source.frames():
+            odometry = odometry or RgbdOdometry(entry.T_map_camera)
+            yield replace(entry, T_map_camera=odometry.update(entry.frame).T_map_camera)
+
+    def noisy() -> Iterator[MapFrame]:
+        oracle = NoisyPoses(np.random.default_rng([seed, 0x504F5345]))
+        for entry in source.frames():
+            T = entry.T_map_camera
+            yield replace(entry, T_map_camera=None if T is None else oracle.pose(entry.frame.stamp, T))
+
+    return replace(source, frames=estimated if poses == "estimated" else noisy)
+
+
 def map_source(
-    source: str, segmenter: str | None = None, film: FilmConfig | None = None, strength: float = 1.0, seed: int = 0
+    source: str,
+    segmenter: str | None = None,
+    film: FilmConfig | None = None,
+    strength: float = 1.0,
+    seed: int = 0,
+    poses: Poses = "true",
 ) -> MapSource:
     """The source that a user names.
 
@@ -124,6 +162,7 @@ def map_source(
         film: how a room is filmed; of a recording, the first `FilmConfig.frames` frames are taken.
         strength: of the oracle's errors.
         seed: of a scene whose name fixes none, of the walk and of the errors.
+        poses: of the camera, see `with_poses`.
 
     Raises:
         UnknownNameError: no such scene.
@@ -135,7 +174,7 @@ def map_source(
     if path.exists() and not (path / "scene.yaml").is_file() and path.suffix not in (".yaml", ".yml", ".xml"):
         if segmenter == ORACLE:
             raise InvalidValueError("segmenter", segmenter, f"another: nobody knows what {source} truly shows")
-        return _recording(path, film, _segmenter(segmenter or NONE))
+        return with_poses(_recording(path, film, _segmenter(segmenter or NONE), poses != "estimated"), poses, seed)
     scene = load_scene(source)
     if scene.static.builder != "room":
         raise InvalidValueError("source", source, "a furnished room such as rooms:7, or a folder of RGB-D images")
@@ -143,21 +182,22 @@ def map_source(
     kind: RoomKind | None = next((k for k in KINDS if k == scene.static.config.get("kind")), None)
     chosen = None if segmenter in (None, ORACLE) else _segmenter(segmenter)  # before a room is built
     made = room_source(number, kind, film, strength, seed, f"{scene.name}-{number}")
-    return made if chosen is None else replace(made, segmenter=chosen)
+    return with_poses(made if chosen is None else replace(made, segmenter=chosen), poses, seed)
 
 
 def _segmenter(given: str) -> Segmenter:
     return NoSegmenter() if given == NONE else make_segmenter(given)
 
 
-def _recording(path: Path, film: FilmConfig, segmenter: Segmenter) -> MapSource:
+def _recording(path: Path, film: FilmConfig, segmenter: Segmenter, posed: bool) -> MapSource:
     from itertools import islice
 
     from simtrack.recordings.source import open_log
 
     log = open_log(path)
-    if log.sensor != "camera" or not log.posed:
-        raise InvalidValueError("source", str(path), "a recording of an RGB-D camera that states the camera's poses")
+    if log.sensor != "camera" or (posed and not log.posed):
+        allowed = "a recording of an RGB-D camera" + (" that states the camera's poses, or --poses estimated" * posed)
+        raise InvalidValueError("source", str(path), allowed)
     count = film.frames if log.count is None else min(film.frames, log.count)
 
     def frames() -> Iterator[MapFrame]:

@@ -1,12 +1,13 @@
 """The panoptic map: surfaces come back, segments keep their labels, counts decide, nonsense changes nothing."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 
-from simtrack.contracts import CameraIntrinsics, Float64, RgbdFrame, Status
+from simtrack.contracts import NANOSECONDS, CameraIntrinsics, Float64, RgbdFrame, Status
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.geometry.meshes import Mesh, box_mesh, face_areas, face_normals
 from simtrack.geometry.transforms import look_at
@@ -41,7 +42,7 @@ def views(count: int) -> list[tuple[RgbdFrame, Float64, PanopticSegments]]:
             rgb = np.where(hits.instances.reshape(120, 160, 1) == 1, (200, 40, 40), (90, 90, 90)).astype(np.uint8)
             image = np.where(hits.hit, hits.instances + 1, 0).astype(np.int32).reshape(120, 160)
             segments = PanopticSegments(k, image, ("floor", "box"), np.ones(2, np.float32))
-            seen.append((RgbdFrame(k, depth, rgb, CAMERA, np.eye(4), k), T, segments))
+            seen.append((RgbdFrame(k * NANOSECONDS, depth, rgb, CAMERA, np.eye(4), k), T, segments))
     return seen
 
 
@@ -99,6 +100,22 @@ def test_frames_that_cannot_be_used_are_counted_and_change_nothing(mapped: Panop
         update = mapped.integrate(*bad)
         assert update.status is status and update.reason in mapped.skipped
     assert [mapped.volume.count, mapped.frames, mapped.volume.weights.sum(), len(mapped.labels.canonical)] == before
+
+
+def test_a_pose_that_jumps_is_skipped_unless_the_next_one_confirms_it() -> None:
+    frame, T, segments = views(1)[0]
+    panoptic_map = PanopticMap(PanopticMapConfig.of_method("full", 0.05))
+    there = T.copy()
+    there[0, 3] += 1.0
+
+    def statuses(*poses: Float64) -> list[bool]:
+        stamps = range(panoptic_map.frames, panoptic_map.frames + len(poses))
+        frames = [replace(frame, stamp=round(k * NANOSECONDS / 30)) for k in stamps]
+        return [panoptic_map.integrate(f, p, segments).status is Status.OK for f, p in zip(frames, poses, strict=True)]
+
+    assert statuses(T, T, there, T) == [True, True, False, True]
+    assert statuses(there, there, there) == [False, True, True]
+    assert panoptic_map.skipped == {"the pose jumps": 2} and panoptic_map.frames == 5
 
 
 def test_a_map_that_would_grow_too_large_stays_as_it_was() -> None:

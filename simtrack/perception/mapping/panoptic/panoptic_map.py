@@ -5,9 +5,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from simtrack.contracts import Float64, Int32, RgbdFrame, Status
+from simtrack.contracts import NANOSECONDS, Float64, Int32, RgbdFrame, Status
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import is_rigid
+from simtrack.geometry.transforms import difference, is_rigid
 from simtrack.perception.mapping.panoptic.association import AssociationConfig, SegmentLabels
 from simtrack.perception.mapping.panoptic.counts import (
     BACKGROUND,
@@ -44,10 +44,18 @@ class PanopticMapConfig:
     """Metres; farther readings are not used."""
     regularize_every: int = 10
     """Frames."""
+    max_speed: tuple[float, float] = (3.0, 6.0)
+    """m/s and rad/s that a camera in hands or on a robot does not exceed: a faster step is taken for a wrong pose,
+    unless the next frame confirms it."""
+    max_step: tuple[float, float] = (0.1, 0.2)
+    """Metres and radians that are believed however short the time."""
 
     def __post_init__(self) -> None:
         if not 0.1 <= self.max_depth <= 50.0:
             raise InvalidValueError("PanopticMapConfig.max_depth", self.max_depth, "0.1 to 50 metres")
+        for name in ("max_speed", "max_step"):
+            if not min(getattr(self, name)) > 0.0:
+                raise InvalidValueError(f"PanopticMapConfig.{name}", getattr(self, name), "above 0")
         if self.regularize_every < 1:
             raise InvalidValueError("PanopticMapConfig.regularize_every", self.regularize_every, "1 or more")
 
@@ -98,6 +106,9 @@ class PanopticMap:
         """Frames that were fused."""
         self.skipped: dict[str, int] = {}
         """Reason -> frames that were not."""
+        self._fused: tuple[int, Float64] | None = None
+        self._seen: tuple[int, Float64] | None = None
+        """Stamp and pose of the last frame that was fused, and of the last with a pose."""
 
     def integrate(
         self,
@@ -119,6 +130,10 @@ class PanopticMap:
         reason = _unusable(frame, T_map_camera, panoptic)
         if reason or T_map_camera is None or panoptic is None:
             return self._skip(frame, reason)
+        now, last = (frame.stamp, np.array(T_map_camera, float)), (self._fused, self._seen)
+        self._seen = now
+        if last[0] is not None and not any(self._follows(now, each) for each in last):
+            return self._skip(frame, "the pose jumps")
         depth = np.where(frame.depth <= self.config.max_depth, frame.depth, np.float32(0.0))
         depth = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
         if not depth.any():
@@ -140,6 +155,7 @@ class PanopticMap:
             blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera)
         except InvalidValueError as error:
             return self._skip(frame, str(error))
+        self._fused = now
         self.counts.observe(_observations(segments, labels, panoptic))
         for label, other in self.labels.count_overlaps(met, counts, least):
             self._merge(label, other)
@@ -159,6 +175,16 @@ class PanopticMap:
         if first != second and self.counts.alike(first, second):
             self.labels.merge(second, into=first)
             self.counts.merge(second, into=first)
+
+    def _follows(self, now: tuple[int, Float64], before: tuple[int, Float64] | None) -> bool:
+        """Whether a camera can have come from one pose to the other in that time; either way, streams may go back."""
+        if before is None:
+            return False
+        seconds = abs(now[0] - before[0]) / NANOSECONDS
+        xi = difference(now[1], before[1])
+        moved = np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
+        limits = zip(moved, self.config.max_speed, self.config.max_step, strict=True)
+        return all(step <= speed * seconds + slack for step, speed, slack in limits)
 
     def _skip(self, frame: RgbdFrame, reason: str, status: Status = Status.FAILED) -> MapUpdate:
         self.skipped[reason] = self.skipped.get(reason, 0) + 1
