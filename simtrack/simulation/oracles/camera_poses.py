@@ -1,4 +1,4 @@
-"""Camera poses with the errors of a visual SLAM system such as ORB-SLAM2 with an RGB-D camera (Mur-Artal, Tardos, 2017).
+"""Camera poses with the errors of a visual SLAM system such as ORB-SLAM2 with an RGB-D camera (Mur-Artal et al., 2017).
 
 The error is what drifts and is pulled back where places are seen again (a Gauss-Markov process), what each image adds,
 and now and then the loss of the track, from which it returns with another error. Deviations are those of the paper's

@@ -1,8 +1,8 @@
 """Where a handheld RGB-D camera is, from its images alone.
 
-A frame's pose is first told from the frame before by OpenCV's RGB-D odometry (Steinbruecker, Sturm, Cremers, 2011), then
-refined against the signed distance field of all frames so far (Bylow, Sturm, Kerl, Kahl, Cremers, RSS 2013), which keeps
-errors from adding up where the camera comes by again.
+A frame's pose is first told from the frame before by OpenCV's RGB-D odometry (Steinbruecker, Sturm, Cremers, 2011),
+then refined against the signed distance field of all frames so far (Bylow, Sturm, Kerl, Kahl, Cremers, RSS 2013), which
+keeps errors from adding up where the camera comes by again.
 """
 
 from dataclasses import dataclass

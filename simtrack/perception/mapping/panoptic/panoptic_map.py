@@ -73,7 +73,7 @@ class PanopticMapConfig:
             raise InvalidValueError("method", method, ", ".join(METHODS))
         config = PanopticMapConfig(volume=VolumeConfig(voxel=voxel), joint=method == "full")
         if method == "voxbloxpp":
-            config = replace(config, fusion=FrameFusionConfig(split=False, cluster=False))
+            config = replace(config, fusion=FrameFusionConfig(split=False, fill=False, cluster=False, flat=False))
         return config
 
 
