@@ -1,11 +1,12 @@
 """``simtrack map``: from an RGB-D stream to a panoptic map, one mesh an entity."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-FILES = ("entities.json", "surface.ply", "metrics.json", "report.html")
+FILES = ("entities.json", "surface.ply", "map.npz", "metrics.json", "report.html")
 FOLDERS = ("entities",)
 
 
@@ -20,6 +21,8 @@ def map_command(
     frames: int = 300,
     sensor: str = "xtion",
     seed: int = 0,
+    swap: float | None = None,
+    onto: Path | None = None,
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
 ) -> int:
     """Map a filmed room, or a recording of an RGB-D camera: objects and layout as meshes with classes.
@@ -39,6 +42,8 @@ def map_command(
         frames: Of the film; of a recording, the first so many.
         sensor: Camera and noise of the film: xtion or kinect_v2.
         seed: Of a scene whose name fixes none, of the walk, the noise and the errors.
+        swap: Metres from the camera from which parts of the map are kept on disk while it runs; none if not given.
+        onto: Folder of an earlier map, or its map.npz, that is carried on, with its method and voxels.
         overwrite: Replace the results in an existing folder.
     """
     from simtrack.cli import console
@@ -47,12 +52,17 @@ def map_command(
     from simtrack.evaluation.mapping import map_scene, scene_metrics
     from simtrack.evaluation.metrics import write_metrics
     from simtrack.perception.mapping.panoptic.files import write_entities, write_surface
+    from simtrack.perception.mapping.panoptic.map_file import FILE, read_map, write_map
     from simtrack.perception.mapping.panoptic.panoptic_map import PanopticMapConfig
+    from simtrack.perception.mapping.panoptic.regions import SwapConfig
     from simtrack.report.headline import format_metric
     from simtrack.report.map_page import HEADLINE, write_map_page
     from simtrack.simulation.building.rooms.film import FilmConfig
 
     config = PanopticMapConfig.of_method(method, voxel)
+    if swap is not None:
+        config = replace(config, swap=SwapConfig(swap))
+    earlier = None if onto is None else read_map(onto / FILE if onto.is_dir() else onto)
     film = FilmConfig(frames=frames, sensor=sensor)
     folder = out if out is not None else Path("runs") / f"map-{Path(source).name.replace(':', '-')}"
     with (
@@ -60,11 +70,12 @@ def map_command(
         new_folder(folder, overwrite, FILES, FOLDERS) as work,
     ):
         given = map_source(source, segmenter, film, strength, seed, poses)
-        mapped = map_scene(given, config, lambda k, n: line.show(f"frame {k} of {n}", k / n))
+        mapped = map_scene(given, config, lambda k, n: line.show(f"frame {k} of {n}", k / n), earlier)
         line.say("comparing with the truth" if mapped.seen is not None else "measuring")
         metrics = scene_metrics(mapped)
         write_entities(mapped.entities, work)
         write_surface(mapped.map, mapped.entities, work / "surface.ply")
+        write_map(mapped.map, work / FILE)
         write_metrics(work / "metrics.json", metrics)
         line.say("report")
         write_map_page(mapped, metrics, work / "report.html")

@@ -56,6 +56,8 @@ class RunConfig:
     """Run the fixed gaze on the same seed, too."""
     threads: int | None = None
     """Threads of the compiled kernels; all that there are if None."""
+    static_map: Path | None = None
+    """Folder of a survey that the robot is localized in; None: the scene's own."""
     stack: StackConfig = field(default_factory=StackConfig)
     script: tuple[Command, ...] | None = None
     """Commands, one a camera period, that are given instead of the agent's: those of another run, to repeat its way."""
@@ -112,6 +114,7 @@ class RunConfig:
             "tracker": self.tracker,
             "localizer": self.localizer,
             "scene_graph": self.scene_graph,
+            "static_map": None if self.static_map is None else str(self.static_map),
             "oracle": plain(asdict(self.oracle)),
             "stage_limit": self.stage_limit,
             "renderer": self.renderer,

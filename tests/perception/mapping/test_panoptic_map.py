@@ -17,8 +17,10 @@ from simtrack.perception.mapping.panoptic.entities import MapEntityMesh, extract
 from simtrack.perception.mapping.panoptic.files import read_entities, write_entities
 from simtrack.perception.mapping.panoptic.frame_segments import FrameFusionConfig, fuse_segments
 from simtrack.perception.mapping.panoptic.layout import split_walls
-from simtrack.perception.mapping.panoptic.panoptic_map import PanopticMap, PanopticMapConfig
-from simtrack.perception.mapping.panoptic.volume import Volume, VolumeConfig
+from simtrack.perception.mapping.panoptic.map_file import read_map, write_map
+from simtrack.perception.mapping.panoptic.panoptic_map import Method, PanopticMap, PanopticMapConfig
+from simtrack.perception.mapping.panoptic.regions import SwapConfig
+from simtrack.perception.mapping.panoptic.volume import STORED, Volume, VolumeConfig
 from simtrack.perception.segmentation.panoptic import PanopticSegments
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 
@@ -243,3 +245,90 @@ def test_walls_are_told_apart() -> None:
     split = split_walls([MapEntityMesh("wall1", "wall", 1, 1.0, both)], np.random.default_rng(0))
     sides = {int(np.argmin(entity.mesh.extents[:2])) for entity in split}
     assert sides == {0, 1} and all(min(entity.mesh.extents[:2]) < 0.05 for entity in split)
+
+
+# ----------------------------------------------------------------------------------------------- saved and swapped out
+
+
+def along(count: int) -> list[tuple[RgbdFrame, Float64, PanopticSegments]]:
+    """Three boxes in a row on the ground, seen on the way past them and back."""
+    seen, bundle = [], RayBundle.from_camera(CAMERA)
+    ground = box_mesh((9.0, 2.0, 0.2))
+    with RayScene() as scene:
+        scene.add(TriangleMesh(ground.vertices - [0.0, 0.0, 0.1], ground.faces), instance=0)
+        for number in range(3):
+            scene.add(TriangleMesh(BOX.vertices + [3.0 * number - 3.0, 0.0, 0.0], BOX.faces), instance=number + 1)
+        for k in range(count):
+            x = 3.5 * np.cos(2.0 * np.pi * k / count)
+            T = look_at(np.array([x, -1.0, 0.8]), np.array([x, 0.0, 0.1]))
+            hits = scene.cast(bundle, T, 2.0)
+            depth = np.where(hits.hit, hits.distances, 0.0).astype(np.float32).reshape(120, 160)
+            image = np.where(hits.hit, hits.instances + 1, 0).astype(np.int32).reshape(120, 160)
+            present = np.unique(image[image > 0])
+            numbers = np.zeros(5, np.int32)
+            numbers[present] = np.arange(1, len(present) + 1)
+            classes = tuple("floor" if p == 1 else "box" for p in present.tolist())
+            segments = PanopticSegments(k, numbers[image], classes, np.ones(len(classes), np.float32))
+            seen.append((RgbdFrame(k * NANOSECONDS, depth, None, CAMERA, np.eye(4), k), T, segments))
+    return seen
+
+
+def same_entities(first: PanopticMap, second: PanopticMap) -> bool:
+    a, b = first.entities(), second.entities()
+    assert [e.name for e in a] == [e.name for e in b] and len(a) > 1
+    return all(
+        np.array_equal(x.mesh.vertices, y.mesh.vertices) and np.array_equal(x.mesh.faces, y.mesh.faces)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+def test_what_is_far_is_written_away_and_the_map_is_the_same() -> None:
+    config = replace(PanopticMapConfig.of_method("full", 0.03), max_depth=1.2)
+    swapping = PanopticMap(replace(config, swap=SwapConfig(2.4, region=4, every=2)))
+    kept, most, frames = PanopticMap(config), 0, along(40)
+    with swapping:
+        for frame, T, segments in frames:
+            assert swapping.integrate(frame, T, segments).status is Status.OK
+            kept.integrate(frame, T, segments)
+            most = max(most, swapping.volume.count)
+        assert swapping.regions is not None and swapping.regions.written > 10
+        assert most < 0.85 * kept.volume.count
+        assert same_entities(kept, swapping)
+        for name in STORED:
+            np.testing.assert_array_equal(kept.volume.blocks()[name], swapping.volume.blocks()[name])
+
+
+def test_regions_within_reach_are_not_to_be_written_away() -> None:
+    with pytest.raises(InvalidValueError, match="reach"):
+        PanopticMap(PanopticMapConfig(swap=SwapConfig(1.0)))
+
+
+@pytest.mark.parametrize("method", ["full", "no-joint-fusion"])
+def test_a_map_that_was_saved_is_carried_on_as_if_it_had_not_been(method: Method, tmp_path: Path) -> None:
+    frames = along(12)
+    whole, half = (PanopticMap(PanopticMapConfig.of_method(method, 0.05)) for _ in range(2))
+    for k, (frame, T, segments) in enumerate(frames):
+        whole.integrate(frame, T, segments)
+        if k == 6:
+            write_map(half, tmp_path / "map.npz")
+            half = read_map(tmp_path / "map.npz")
+        half.integrate(frame, T, segments)
+    assert half.config == whole.config and half.frames == whole.frames == 12
+    assert same_entities(whole, half)
+
+
+def test_damaged_maps_are_refused(mapped: PanopticMap, tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    write_map(mapped, path)
+    data = path.read_bytes()
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    for broken in (b"", b"nonsense", data[: len(data) // 2]):
+        path.write_bytes(broken)
+        with pytest.raises(FileFormatError):
+            read_map(path)
+    for name, values in (("labels", arrays["labels"] + 10**6), ("weights", arrays["weights"][:1]),
+                         ("document", np.array("{}")), ("keys", arrays["keys"] * 0)):  # fmt: skip
+        np.savez(path, **{**arrays, name: values})
+        with pytest.raises(FileFormatError):
+            read_map(path)

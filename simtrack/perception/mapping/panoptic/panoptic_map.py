@@ -1,6 +1,7 @@
 """The panoptic map: frames in, entities out."""
 
 from dataclasses import dataclass, field, replace
+from types import TracebackType
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -20,6 +21,7 @@ from simtrack.perception.mapping.panoptic.counts import (
 )
 from simtrack.perception.mapping.panoptic.entities import EntityConfig, MapEntityMesh, extract_entities
 from simtrack.perception.mapping.panoptic.frame_segments import FrameFusionConfig, FrameSegments, fuse_segments
+from simtrack.perception.mapping.panoptic.regions import SwapConfig, SwappedRegions
 from simtrack.perception.mapping.panoptic.volume import Volume, VolumeConfig
 from simtrack.perception.segmentation.geometric import GeometricConfig, depth_segments
 from simtrack.perception.segmentation.panoptic import PanopticSegments
@@ -44,6 +46,8 @@ class PanopticMapConfig:
     """Metres; farther readings are not used."""
     regularize_every: int = 10
     """Frames."""
+    swap: SwapConfig | None = None
+    """Which parts of the map are written to disk while the camera is far from them; None keeps all in memory."""
     max_speed: tuple[float, float] = (3.0, 6.0)
     """m/s and rad/s that a camera in hands or on a robot does not exceed: a faster step is taken for a wrong pose,
     unless the next frame confirms it."""
@@ -94,11 +98,16 @@ class MapUpdate:
 
 
 class PanopticMap:
-    """A TSDF whose voxels carry labels of segments, and what was observed of those."""
+    """A TSDF whose voxels carry labels of segments, and what was observed of those; a context manager if it swaps."""
 
     def __init__(self, config: PanopticMapConfig | None = None) -> None:
         self.config = config or PanopticMapConfig()
         self.volume = Volume(self.config.volume)
+        volume = self.config.volume
+        # The farthest reading in the corner of a wide image, and the truncation behind it.
+        reach = 1.6 * self.config.max_depth + 2.0 * volume.truncation * volume.voxel
+        self.regions = None if self.config.swap is None else SwappedRegions(self.volume, reach, self.config.swap)
+        """Where far parts are, if they are written away."""
         self.labels = SegmentLabels(self.config.association)
         counts = JointCounts if self.config.joint else SeparateCounts
         self.counts: PanopticCounts = counts(self.config.counts)
@@ -143,6 +152,8 @@ class PanopticMap:
         stuff = self.config.counts.stuff
         segments = fuse_segments(geometric, panoptic, depth, frame.intrinsics, stuff, self.config.fusion)
         stride = max(1, round(frame.intrinsics.width / 320))
+        if self.regions is not None:
+            self.regions.approach(now[1][:3, 3])
         met, counts = self.volume.overlaps(
             depth, segments.image, frame.intrinsics, T_map_camera, self.labels.canonical, stride
         )
@@ -166,8 +177,28 @@ class PanopticMap:
 
     def entities(self) -> tuple[MapEntityMesh, ...]:
         """The entities of the map, stuff first, then things, by class and number."""
+        self.complete()
         self.counts.regularize()
         return extract_entities(self.volume, self.labels.canonical, self.counts.entities(), self.config.entities)
+
+    def close(self) -> None:
+        """Remove the files of what was written away."""
+        if self.regions is not None:
+            self.regions.close()
+
+    def __enter__(self) -> "PanopticMap":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def complete(self) -> None:
+        """Bring back what was written away, and order the volume: the same map is the same bytes."""
+        if self.regions is not None:
+            self.regions.bring_all()
+        self.volume.order()
 
     def _merge(self, label: int, other: int) -> None:
         canonical = self.labels.canonical
