@@ -15,7 +15,7 @@ from simtrack.perception.mapping.panoptic.association import SegmentLabels
 from simtrack.perception.mapping.panoptic.counts import CountsConfig, JointCounts, Observation, SeparateCounts
 from simtrack.perception.mapping.panoptic.entities import MapEntityMesh, extract_surface
 from simtrack.perception.mapping.panoptic.files import read_entities, write_entities
-from simtrack.perception.mapping.panoptic.frame_segments import FrameFusionConfig, fuse_segments
+from simtrack.perception.mapping.panoptic.frame_segments import SILENT, FrameFusionConfig, fuse_segments
 from simtrack.perception.mapping.panoptic.layout import split_walls
 from simtrack.perception.mapping.panoptic.map_file import read_map, write_map
 from simtrack.perception.mapping.panoptic.panoptic_map import Method, PanopticMap, PanopticMapConfig
@@ -332,3 +332,64 @@ def test_damaged_maps_are_refused(mapped: PanopticMap, tmp_path: Path) -> None:
         np.savez(path, **{**arrays, name: values})
         with pytest.raises(FileFormatError):
             read_map(path)
+
+
+# ------------------------------------------------------------------------ what full evidence asks for in a single frame
+
+
+def flat_scene() -> tuple[np.ndarray, np.ndarray]:
+    """Depth of a wall at 2 m with a bottle 0.3 m before it, and their geometric segments."""
+    depth = np.full((120, 160), 2.0, np.float32)
+    geometric = np.ones((120, 160), np.int32)
+    depth[40:80, 70:85], geometric[40:80, 70:85] = 1.7, 2
+    return depth, geometric
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_what_stands_before_a_wall_and_was_not_found_is_not_wall(flat: bool) -> None:
+    depth, geometric = flat_scene()
+    wall = PanopticSegments(0, np.ones((120, 160), np.int32), ("wall",), np.ones(1, np.float32))
+    fused = fuse_segments(geometric, wall, depth, CAMERA, {"wall"}, FrameFusionConfig(flat=flat))
+    assert fused.instances[fused.image[0, 0]] == 1
+    assert fused.instances[fused.image[60, 77]] == (SILENT if flat else 1)
+
+
+def test_readings_of_a_mask_beside_its_segment_are_filled_and_others_are_not() -> None:
+    depth, geometric = flat_scene()
+    geometric[38:82, 68:87] = 0  # edges that no segment has, the bottle's and the wall's
+    geometric[42:78, 72:83] = 2
+    image = np.ones((120, 160), np.int32)
+    image[40:80, 70:85] = 2
+    panoptic = PanopticSegments(0, image, ("wall", "bottle"), np.ones(2, np.float32))
+    filled = fuse_segments(geometric, panoptic, depth, CAMERA, {"wall"})
+    np.testing.assert_array_equal(filled.instances[filled.image] == 2, image == 2)
+    kept = fuse_segments(geometric, panoptic, depth, CAMERA, {"wall"}, FrameFusionConfig(fill=False))
+    np.testing.assert_array_equal(kept.image > 0, geometric > 0)
+
+
+def test_thin_things_that_no_geometric_segment_has_are_segments() -> None:
+    depth, geometric = flat_scene()
+    geometric[geometric == 2] = 0
+    image = np.where(depth < 1.9, 2, 1).astype(np.int32)
+    panoptic = PanopticSegments(0, image, ("wall", "lamp"), np.ones(2, np.float32))
+    fused = fuse_segments(geometric, panoptic, depth, CAMERA, {"wall"})
+    number = int(fused.image[60, 77])
+    assert fused.instances[number] == 2 and fused.sizes[number] == (image == 2).sum()
+
+
+def test_entities_that_few_frames_speak_for_are_dropped() -> None:
+    frame, T, segments = views(1)[0]
+    panoptic_map = PanopticMap(PanopticMapConfig.of_method("full", 0.03))
+    for expected in (0, 0, 2):
+        assert panoptic_map.integrate(frame, T, segments).status is Status.OK
+        assert len(panoptic_map.entities()) == expected
+
+
+def test_what_is_cut_off_from_a_thing_says_nothing_or_background() -> None:
+    geometric = np.ones((120, 160), np.int32)
+    geometric[:, 110:] = 2
+    depth = np.where(geometric == 2, 2.0, 1.0).astype(np.float32)
+    panoptic = PanopticSegments(0, np.ones((120, 160), np.int32), ("chair",), np.ones(1, np.float32))
+    for silent, expected in ((True, SILENT), (False, 0)):
+        fused = fuse_segments(geometric, panoptic, depth, CAMERA, config=FrameFusionConfig(silent=silent))
+        assert fused.instances[fused.image[0, 150]] == expected

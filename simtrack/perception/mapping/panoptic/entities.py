@@ -25,7 +25,9 @@ class EntityConfig:
     """1/m^2: voxels of less weight (one reading at a metre has 1) count as unseen."""
     least_support: float = 0.25
     """Share of the support that the surface of a thing has in the middle (median) below which a part of it is dropped:
-    masks that reached over its border leave a fringe."""
+    masks that reached over its border leave a fringe ..."""
+    enough_support: float = 2.5
+    """... unless it has so much."""
     least_observed: int = 3
     """Observations of one of its segments that must agree on what an entity is; what fewer say is dropped."""
     least_area: float = 0.002
@@ -38,7 +40,7 @@ class EntityConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.least_observed <= 1000:
             raise InvalidValueError("EntityConfig.least_observed", self.least_observed, "1 to 1000")
-        for name in ("least_weight", "least_area", "gap"):
+        for name in ("least_weight", "least_area", "gap", "enough_support"):
             if not 0.0 < getattr(self, name) < 1e6:
                 raise InvalidValueError(f"EntityConfig.{name}", getattr(self, name), "a finite number > 0")
         for name in ("least_support", "least_piece"):
@@ -133,7 +135,7 @@ def extract_entities(
         faces = order[bounds[k] : bounds[k + 1]]
         if name not in STUFF_FIRST and len(faces):
             support = surface.support[faces]
-            faces = faces[support >= config.least_support * np.median(support)]
+            faces = faces[support >= min(config.least_support * np.median(support), config.enough_support)]
         mesh = _part(surface, faces)
         if name not in STUFF_FIRST and config.least_piece > 0.0:
             mesh = _large_pieces(mesh, config.gap, config.least_piece)

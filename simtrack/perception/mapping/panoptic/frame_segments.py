@@ -44,6 +44,9 @@ class FrameFusionConfig:
     part is hidden; else it is background, as in the paper."""
     distance: float = 0.05
     """Metres between segments of one cluster."""
+    hidden: tuple[float, float] = (0.4, 0.2)
+    """Metres from the largest cluster, and share of its readings, up to which what is cut off from it is taken for a
+    part of it to which the way is hidden, as the foot of a table is below its top; zeros: never, as in the paper."""
     flat: bool = True
     """Whether small segments of stuff that lie off the planes of its large ones say nothing in this frame: what stands
     before a wall and was not found is not wall."""
@@ -60,6 +63,8 @@ class FrameFusionConfig:
             raise InvalidValueError("FrameFusionConfig.step", self.step, "a share, above 0 and below 1")
         if not 0.0 < self.distance < 10.0:
             raise InvalidValueError("FrameFusionConfig.distance", self.distance, "metres, above 0 and below 10")
+        if not 0.0 <= min(self.hidden) <= max(self.hidden) < 100.0:
+            raise InvalidValueError("FrameFusionConfig.hidden", self.hidden, "metres and a share, 0 or more")
         for name in ("off_plane", "plane_area"):
             if not 0.0 < getattr(self, name) < 100.0:
                 raise InvalidValueError(f"FrameFusionConfig.{name}", getattr(self, name), "above 0 and below 100")
@@ -126,8 +131,7 @@ def fuse_segments(
         segments = _filled(segments, panoptic.image, depth, config.step, least)
     if config.cluster and masks:
         things = [k + 1 for k, name in enumerate(panoptic.classes) if name not in stuff]
-        rest = SILENT if config.silent else 0
-        _keep_largest_clusters(segments, panoptic.image, things, depth, intrinsics, config.distance, rest)
+        _keep_largest_clusters(segments, panoptic.image, things, depth, intrinsics, config)
     if config.flat:
         for number in (k + 1 for k, name in enumerate(panoptic.classes) if name in stuff):
             _keep_planes(segments, number, depth, intrinsics, config)
@@ -191,9 +195,9 @@ def _extracted(joint: np.ndarray, least: int, config: FrameFusionConfig) -> np.n
 
 def _keep_largest_clusters(
     segments: FrameSegments, masks: Int32, things: Sequence[int], depth: Float32, intrinsics: CameraIntrinsics,
-    distance: float, rest: int,
+    config: FrameFusionConfig,
 ) -> None:  # fmt: skip
-    """Take the segments of a thing that are not in its largest cluster out of it, in place; they become `rest`.
+    """Take the segments of a thing that are not in its largest cluster out of it, in place.
 
     Readings of its mask that are in no segment, as those on edges, hold segments together too.
     """
@@ -205,11 +209,31 @@ def _keep_largest_clusters(
         if len(members) < 2:
             continue
         masks_of = [sparse == number for number in members.tolist()]
-        points = [_points(chosen, depth, intrinsics, stride, 0.5 * distance) for chosen in masks_of]
-        loose = _points(free & (mask == thing), depth, intrinsics, stride, 0.5 * distance)
-        cluster = _clusters([*points, *loose[:, None]], distance)[: len(members)]
+        cell = 0.5 * config.distance
+        points = [_points(chosen, depth, intrinsics, stride, cell) for chosen in masks_of]
+        loose = _points(free & (mask == thing), depth, intrinsics, stride, cell)
+        cluster = _clusters([*points, *loose[:, None]], config.distance)[: len(members)]
         weight = np.bincount(cluster, segments.sizes[members])
-        segments.instances[members[cluster != weight.argmax()]] = rest
+        main = int(weight.argmax())
+        hidden = _hidden(points, cluster, weight, main, config)
+        segments.instances[members[(cluster != main) & ~hidden[cluster]]] = SILENT if config.silent else 0
+
+
+def _hidden(
+    points: Sequence[Float64], cluster: np.ndarray, weight: np.ndarray, main: int, config: FrameFusionConfig
+) -> np.ndarray:
+    """(K,) bool: clusters that are small and near to the main one."""
+    from scipy.spatial import KDTree
+
+    distance, share = config.hidden
+    small = (weight > 0) & (weight <= share * weight[main])
+    if distance > 0.0 and small.any():
+        tree = KDTree(np.concatenate([p for p, k in zip(points, cluster, strict=True) if k == main]))
+        for number in np.flatnonzero(small).tolist():
+            own = np.concatenate([p for p, k in zip(points, cluster, strict=True) if k == number])
+            near = len(own) and float(tree.query(own, distance_upper_bound=distance)[0].min()) <= distance
+            small[number] = bool(near)
+    return small & (distance > 0.0)
 
 
 def _points(mask: np.ndarray, depth: Float32, intrinsics: CameraIntrinsics, stride: int, cell: float) -> Float64:
