@@ -53,7 +53,7 @@ def map_command(
     from simtrack.evaluation.metrics import write_metrics
     from simtrack.perception.mapping.panoptic.files import write_entities, write_surface
     from simtrack.perception.mapping.panoptic.map_file import FILE, read_map, write_map
-    from simtrack.perception.mapping.panoptic.panoptic_map import PanopticMapConfig
+    from simtrack.perception.mapping.panoptic.panoptic_map import PanopticMap, PanopticMapConfig
     from simtrack.perception.mapping.panoptic.regions import SwapConfig
     from simtrack.report.headline import format_metric
     from simtrack.report.map_page import HEADLINE, write_map_page
@@ -62,15 +62,16 @@ def map_command(
     config = PanopticMapConfig.of_method(method, voxel)
     if swap is not None:
         config = replace(config, swap=SwapConfig(swap))
-    earlier = None if onto is None else read_map(onto / FILE if onto.is_dir() else onto)
+    begun = PanopticMap(config) if onto is None else read_map(onto / FILE if onto.is_dir() else onto)
     film = FilmConfig(frames=frames, sensor=sensor)
     folder = out if out is not None else Path("runs") / f"map-{Path(source).name.replace(':', '-')}"
     with (
         console.ProgressLine(f"map {source}", "looking at the source", to_stderr=True) as line,
         new_folder(folder, overwrite, FILES, FOLDERS) as work,
+        begun,
     ):
         given = map_source(source, segmenter, film, strength, seed, poses)
-        mapped = map_scene(given, config, lambda k, n: line.show(f"frame {k} of {n}", k / n), earlier)
+        mapped = map_scene(given, config, lambda k, n: line.show(f"frame {k} of {n}", k / n), begun)
         line.say("comparing with the truth" if mapped.seen is not None else "measuring")
         metrics = scene_metrics(mapped)
         write_entities(mapped.entities, work)

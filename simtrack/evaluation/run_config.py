@@ -16,6 +16,7 @@ from simtrack.perception.pipeline import StackConfig
 from simtrack.simulation.agents import AGENTS
 from simtrack.simulation.oracles import OracleDetectorConfig
 from simtrack.simulation.scene_file import SceneFile
+from simtrack.simulation.survey_files import check_survey
 
 ORACLE = "oracle"
 """The detector that knows the truth, and errs like a trained network; the localizer that knows it and does not err."""
@@ -81,6 +82,8 @@ class RunConfig:
             raise InvalidValueError("stage_limit", self.stage_limit, "more than 0 and at most 3600 seconds")
         for stage, given in self.foreign.items():
             check_stage(stage, given)
+        if self.static_map is not None:
+            check_survey(self.static_map)
 
     @property
     def seconds(self) -> float:

@@ -33,6 +33,12 @@ def write_survey(static_map: StaticMap, folder: Path) -> list[str]:
     return [FILE, MESH]
 
 
+def check_survey(path: Path) -> None:
+    """Whether there is a survey, before anything is built; raises FileFormatError."""
+    if not (path / FILE if path.is_dir() else path).is_file():
+        raise FileFormatError(path, "", f"no {FILE} there; `simtrack survey SCENE --out DIR` makes one")
+
+
 def read_survey(path: Path) -> StaticMap:
     """Read a survey from its folder, or its ``survey.npz``.
 

@@ -38,4 +38,4 @@ def test_one_seed_gives_the_same_errors() -> None:
 @pytest.mark.parametrize("wrong", [{"lost": 2.0}, {"correlation": 0.0}, {"jump": -1.0}])
 def test_errors_outside_their_domain_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InvalidValueError, match=next(iter(wrong))):
-        PoseErrors(**wrong)
+        PoseErrors(**wrong)  # type: ignore[arg-type]

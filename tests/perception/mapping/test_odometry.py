@@ -43,7 +43,7 @@ def corner():
 
 def walk(count: int) -> list[Float64]:
     """A smooth way past the corner."""
-    steps = np.arange(count)[:, None] * np.array([0.012, -0.01, 0.003, 0.002, 0.003, -0.012])
+    steps = np.outer(np.arange(count), [0.012, -0.01, 0.003, 0.002, 0.003, -0.012]).astype(np.float64)
     return [perturb(START, step) for step in steps]
 
 
