@@ -6,10 +6,14 @@ not raise: it reports a status (see `simtrack.contracts.Status`) and keeps its s
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 
 class SimtrackError(Exception):
-    """Base of all errors raised by simtrack."""
+    """Base of all errors raised by simtrack. They pass from process to process, message and attributes alike."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _raised_elsewhere, (type(self), self.args, vars(self))
 
 
 class UnknownNameError(SimtrackError):
@@ -80,3 +84,11 @@ class StageError(SimtrackError):
     def __init__(self, stage: str, given: str, reason: str) -> None:
         self.stage, self.given, self.reason = stage, given, reason
         super().__init__(f"{stage} '{given}': {reason}")
+
+
+def _raised_elsewhere(kind: type[SimtrackError], args: tuple[Any, ...], attributes: dict[str, Any]) -> SimtrackError:
+    """An error as another process had it: its own constructor takes other arguments than the message."""
+    error = kind.__new__(kind)
+    error.args = args
+    vars(error).update(attributes)
+    return error

@@ -13,7 +13,9 @@ class LatestDetection:
 
     def update(self, frame, T_map_camera, covariance, hypotheses=()):
         self.cameras[frame.stamp] = T_map_camera
-        for h in hypotheses:  # of an earlier image: detections take their time
+        for h in hypotheses:  # of an earlier image, which a stage that was late then has never seen
+            if h.stamp not in self.cameras:
+                continue
             T_map_object = self.cameras[h.stamp] @ h.T_camera_object
             for entry in self.found:
                 if entry[0] == h.class_name and np.linalg.norm(entry[1][:3, 3] - T_map_object[:3, 3]) < 0.1:

@@ -53,6 +53,8 @@ def main() -> None:
             continue
         cameras[message["stamp"]] = message["T_map_camera"]
         for seen in message["hypotheses"]:
+            if seen["stamp"] not in cameras:
+                continue  # of an image that came while this program was late, and was never handed over
             T_map_object = multiply(cameras[seen["stamp"]], seen["T_camera_object"])
             near = [
                 number

@@ -23,7 +23,8 @@ from simtrack.benchmarks.feed import Feed
 from simtrack.benchmarks.harness import Benchmark, Options
 from simtrack.contracts import NANOSECONDS, LidarScan, RgbdFrame, SensorFrame
 from simtrack.perception.localization.measurement import scan_end
-from simtrack.perception.pipeline import PerceptionStack, StackConfig
+from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.stack_config import StackConfig
 from simtrack.recordings import Recording
 
 SWITCH_INTERVAL = 2e-4

@@ -28,7 +28,7 @@ def debug(
     from simtrack.evaluation.instrument.examination import examine
     from simtrack.evaluation.instrument.moments import FOLDER, read_moment, stored_frames
     from simtrack.evaluation.instrument.rebuilding import rebuilt_models
-    from simtrack.perception.pipeline import StackConfig
+    from simtrack.perception.stack_config import StackConfig
     from simtrack.report.moment_page import COLUMNS, rows, told_error, write_picture
 
     if frame is None:

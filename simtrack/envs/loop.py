@@ -13,7 +13,8 @@ from simtrack.envs.resolution import noise_in_small_images, stack_config
 from simtrack.envs.settings import Settings, pixel_scale
 from simtrack.envs.truth import IdealPerception, true_belief
 from simtrack.perception.localization import MeshLocalizer
-from simtrack.perception.pipeline import PerceptionStack, StackConfig
+from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.stack_config import StackConfig
 from simtrack.sensors.depth_noise import PRESETS
 from simtrack.simulation.ground_truth import Truth
 from simtrack.simulation.oracles import OracleDetector
@@ -105,7 +106,9 @@ class Loop:
             simulation.static_map,
             simulation.models,
             simulation.robot,
-            OracleDetector(simulation.truth, simulation.models, seed, errors),
+            OracleDetector(
+                simulation.truth, simulation.models, seed, errors, simulation.calibration.camera_time_offset
+            ),
             T_map_base=simulation.start,
             config=_without_threads(stack_config(pixel_scale(simulation.camera))),
         )

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
-from simtrack.perception.pipeline import StackConfig
+from simtrack.perception.stack_config import StackConfig
 from simtrack.perception.tracking.registration_config import RegistrationConfig, Step
 from simtrack.sensors.depth_noise import PRESETS
 

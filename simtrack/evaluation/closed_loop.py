@@ -171,7 +171,8 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
 
 def _own_detector(config: RunConfig, simulation: Simulation) -> Detector:
     if config.detector == ORACLE:
-        return OracleDetector(simulation.truth, simulation.models, config.seed, config.oracle)
+        offset = simulation.calibration.camera_time_offset
+        return OracleDetector(simulation.truth, simulation.models, config.seed, config.oracle, offset)
     return make_image_detector(config.detector, simulation.models)
 
 

@@ -31,10 +31,10 @@ from simtrack.evaluation.presegmentation import (
 from simtrack.evaluation.record import Album
 from simtrack.evaluation.relations import RelationEvaluator
 from simtrack.evaluation.tracking import ObjectFrame, TrackingEvaluator
-from simtrack.evaluation.trajectory import TrajectoryEvaluator
+from simtrack.evaluation.trajectory import SETTLED, TrajectoryEvaluator
 from simtrack.geometry.transforms import angle_between
 from simtrack.objects import ObjectModel
-from simtrack.perception.pipeline import StackConfig
+from simtrack.perception.stack_config import StackConfig
 from simtrack.simulation.simulation import Simulation
 
 PERIOD = NANOSECONDS // 2
@@ -80,7 +80,7 @@ class Evaluator:
         truth, models = simulation.truth, true_models(simulation)
         self._simulation, self._truth = simulation, truth
         self._scorers = pose_scorers(models)
-        self.trajectory = TrajectoryEvaluator()
+        self.trajectory = TrajectoryEvaluator(SETTLED)
         self.tracking = TrackingEvaluator(self._scorers)
         self.identity = IdentityEvaluator()
         self.bop = BopRecall(models, self._scorers)

@@ -15,7 +15,8 @@ from simtrack.evaluation.process import Clock, StopSignal, peak_memory, set_thre
 from simtrack.evaluation.run_config import versions
 from simtrack.evaluation.run_folder import EstimateTables, RunFolder
 from simtrack.geometry.transforms import is_rigid
-from simtrack.perception.pipeline import PerceptionStack, StackConfig
+from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.stack_config import StackConfig
 from simtrack.recordings import RecordedDetector, open_recording
 
 

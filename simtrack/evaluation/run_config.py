@@ -12,7 +12,7 @@ from simtrack.perception.detection.loading import ALLOWED as IMAGE_DETECTORS
 from simtrack.perception.detection.loading import check_image_detector, is_image_detector
 from simtrack.perception.foreign import check_stage
 from simtrack.perception.foreign.guards import DEFAULT_LIMIT
-from simtrack.perception.pipeline import StackConfig
+from simtrack.perception.stack_config import StackConfig
 from simtrack.simulation.agents import AGENTS
 from simtrack.simulation.oracles import OracleDetectorConfig
 from simtrack.simulation.scene_file import SceneFile

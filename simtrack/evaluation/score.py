@@ -26,7 +26,7 @@ from simtrack.evaluation.result_files import (
 )
 from simtrack.evaluation.run_truth import RunTruth, TrueObject, read_truth
 from simtrack.evaluation.tracking import TrackingEvaluator
-from simtrack.evaluation.trajectory import TrajectoryEvaluator, absolute_errors
+from simtrack.evaluation.trajectory import SETTLED, TrajectoryEvaluator, absolute_errors
 from simtrack.geometry.transforms import angle_between, rotation_from_quaternion
 from simtrack.objects import load_object
 from simtrack.simulation.ground_truth import ObjectTruth, Truth
@@ -205,7 +205,7 @@ def _score_trajectory(truth: RunTruth, path: Path) -> Score:
         findings.append("positions are taken for millimetres: as metres they would be far from the true path")
         estimated = [_scaled(T, unit) for T in estimated]
     findings += _swapped_quaternions([matched[image] for image in chosen], true)
-    evaluator = TrajectoryEvaluator()
+    evaluator = TrajectoryEvaluator(SETTLED)
     for image, T_estimated, T_true in zip(chosen, estimated, true, strict=True):
         found = Localization(truth.stamps[image], T_estimated, np.eye(6), Status.OK)
         evaluator.observe(truth.stamps[image], found, T_true)

@@ -2,6 +2,9 @@
 
 Definitions after Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012. There trajectories
 are aligned first; here both are poses in the same surveyed map, so that a shift is an error and none is taken away.
+
+A run starts from a pose that is given with an error. Until the first scan is complete and has been matched nobody can
+know better, so errors of a run count from `SETTLED` on; when the belief was first trusted is a figure of its own.
 """
 
 from collections.abc import Sequence
@@ -11,6 +14,9 @@ import numpy as np
 from simtrack.contracts import NANOSECONDS, Float64, Localization, Status
 from simtrack.evaluation.metrics import Metrics, measured, quantile, ratio, unmeasured
 from simtrack.geometry.transforms import angle_between, inverse
+
+SETTLED = NANOSECONDS // 2
+"""Stamp from which errors of a run count, nanoseconds: five turns of the lidar after its start."""
 
 
 def absolute_errors(estimated: Sequence[Float64], true: Sequence[Float64]) -> tuple[Float64, Float64]:
@@ -40,34 +46,38 @@ def rmse(errors: Float64) -> float:
 class TrajectoryEvaluator:
     """Collects true and believed poses of the robot's base, one pair a camera stamp."""
 
-    def __init__(self) -> None:
+    def __init__(self, since: int = 0) -> None:
+        """Errors count from the stamp `since` on, nanoseconds."""
+        self._since = since
         self.stamps: list[int] = []
         self.estimated: list[Float64] = []
         self.true: list[Float64] = []
-        self._trusted = 0
+        self._trusted: list[int] = []
 
     def observe(self, stamp: int, localization: Localization, T_map_base: Float64) -> None:
         """Take one believed and one true pose."""
         self.stamps.append(stamp)
         self.estimated.append(localization.T_map_base)
         self.true.append(T_map_base)
-        self._trusted += localization.status is Status.OK
-
-    def errors(self) -> tuple[Float64, Float64]:
-        """(N,) translation errors in metres and (N,) rotation errors in radians, by camera stamp."""
-        return absolute_errors(self.estimated, self.true)
+        if localization.status is Status.OK:
+            self._trusted.append(stamp)
 
     def metrics(self) -> Metrics:
         """The ``localization.*`` metrics."""
         missing = "no frame was processed"
-        metrics: Metrics = {"localization.trusted_share": ratio(self._trusted, len(self.stamps), missing)}
-        translation, rotation = self.errors()
+        metrics: Metrics = {"localization.trusted_share": ratio(len(self._trusted), len(self.stamps), missing)}
+        waited = [(stamp - self.stamps[0]) / NANOSECONDS for stamp in self._trusted[:1]]
+        metrics["localization.first_trusted"] = measured(waited[0], "s") if waited else unmeasured("s", "never trusted")
+        first = int(np.searchsorted(self.stamps, self._since))
+        stamps, estimated, true = self.stamps[first:], self.estimated[first:], self.true[first:]
+        translation, rotation = absolute_errors(estimated, true)
+        missing = f"no frame was processed after the first {self._since / NANOSECONDS:g} s"
         for name, unit, errors in (("ate", "m", translation), ("rotation", "rad", rotation)):
             empty = unmeasured(unit, missing)
             metrics[f"localization.{name}_rmse"] = measured(rmse(errors), unit) if errors.size else empty
             metrics[f"localization.{name}_max"] = measured(errors.max(), unit) if errors.size else empty
-        translation, rotation = relative_errors(self.stamps, self.estimated, self.true)
-        missing = "the run was shorter than a second"
+        translation, rotation = relative_errors(stamps, estimated, true)
+        missing = f"the run was shorter than a second after the first {self._since / NANOSECONDS:g} s"
         for name, unit, errors in (("translation", "m", translation), ("rotation", "rad", rotation)):
             found = measured(rmse(errors), unit) if errors.size else unmeasured(unit, missing)
             metrics[f"localization.rpe.{name}.rmse"] = found

@@ -24,7 +24,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
@@ -58,54 +57,18 @@ from simtrack.geometry.transforms import is_rigid, with_lever
 from simtrack.objects import ObjectModel
 from simtrack.perception.believed_scene import MAP, BelievedScene
 from simtrack.perception.beside import Beside, worker
-from simtrack.perception.detection.runner import DetectorRunner, RunnerConfig
-from simtrack.perception.localization import LocalizerConfig, MeshLocalizer
+from simtrack.perception.detection.runner import DetectorRunner
+from simtrack.perception.localization import MeshLocalizer
 from simtrack.perception.localization.measurement import scan_end
 from simtrack.perception.presegmenter import Presegmenter
-from simtrack.perception.scene_graph import SceneGraph, SceneGraphConfig
+from simtrack.perception.scene_graph import SceneGraph
 from simtrack.perception.self_filter import SelfFilter
-from simtrack.perception.tracking.articulation import ArticulationConfig, ArticulationTracker
-from simtrack.perception.tracking.presegmentation import PresegmentationConfig, shot_stamps
-from simtrack.perception.tracking.registration_config import RegistrationConfig
-from simtrack.perception.tracking.target import TrackerConfig
+from simtrack.perception.stack_config import StackConfig
+from simtrack.perception.tracking.articulation import ArticulationTracker
+from simtrack.perception.tracking.presegmentation import shot_stamps
 from simtrack.perception.tracking.tracker import ObjectTracker
 
 T = TypeVar("T")
-
-LIVE_PATIENCE = 0.008
-"""Seconds; where nothing is in their way, the casts before the last one take half of it."""
-
-
-@dataclass(frozen=True, slots=True)
-class StackConfig:
-    """Settings of all stages."""
-
-    runner: RunnerConfig = field(default_factory=RunnerConfig)
-    tracker: TrackerConfig = field(default_factory=TrackerConfig)
-    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)
-    presegmentation: PresegmentationConfig = field(default_factory=PresegmentationConfig)
-    scene_graph: SceneGraphConfig = field(default_factory=SceneGraphConfig)
-    articulation: ArticulationConfig = field(default_factory=ArticulationConfig)
-    lidar_silence: float = 0.5
-    """Without a scan for this long, seconds, depth images localize the robot."""
-    lidar_presegmentation_every: int = 2
-    """Every how many-th scan is segmented."""
-    correction_time: float = 0.06
-    """A scan's correction of the pose is used this long after the scan's last shot, seconds of the sensor's clock."""
-    segmentation_time: float = 0.06
-    """What is segmented beside the frames is used this long after it was begun, likewise."""
-    wait: bool = True
-    """Frames wait for what is due and not there yet, so that beliefs are the same on every machine; `live` does not."""
-    threads: bool = True
-    """What is done beside the frames is done by threads of its own; else at once, with the same answers."""
-
-    @staticmethod
-    def live() -> "StackConfig":
-        """For a robot, or a feed at the pace of its clock: a late answer is taken up by the frame that finds it, and a
-        frame that has taken long already is done without the last cast.
-        """
-        registration = RegistrationConfig(patience=LIVE_PATIENCE)
-        return StackConfig(wait=False, tracker=TrackerConfig(wait=False, registration=registration))
 
 
 class PerceptionStack:

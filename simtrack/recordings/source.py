@@ -75,19 +75,23 @@ def is_mcap(path: Path) -> bool:
     return path.suffix.lower() == ".mcap" or _head(path).startswith(_MCAP)
 
 
-def open_log(path: Path, options: CameraOptions | None = None) -> SensorLog:
-    """Open a recording of one sensor, of whatever format it is; MCAP has `open_recording`.
+def open_log(path: str | Path, options: CameraOptions | None = None) -> SensorLog:
+    """Open a recording of one sensor, of whatever format it is; MCAP, which has all of them, has `open_recording`.
 
     Raises:
         FileFormatError: nothing that is known, with what would have been, or a damaged one.
     """
-    path = find_source(path)
+    path = find_source(Path(path))
+    if is_mcap(path):
+        raise FileFormatError(
+            path, "", "is an MCAP file, of a whole robot: simtrack.recordings.open_recording reads it"
+        )
     kind = _kind(path) if path.is_dir() else None
     if kind is not None:
         return kind.open(path, options or CameraOptions())
     if pcap.is_capture(_head(path)):
         return velodyne.open_vlp16(path)
-    raise FileFormatError(path, "", f"is no recording of one sensor that is known. Valid: {KNOWN}")
+    raise FileFormatError(path, "", f"is no recording of one sensor that is known. Valid: {_SINGLE}")
 
 
 def _kind(folder: Path) -> Format | None:
@@ -108,7 +112,8 @@ def _below(folder: Path, depth: int) -> Iterator[Path]:
             yield from _below(entry, depth - 1)
 
 
-KNOWN = "an MCAP file, a VLP-16 capture (.pcap), or a folder: " + "; ".join(f"{k.name} ({k.marks})" for k in FOLDERS)
+_SINGLE = "a VLP-16 capture (.pcap), or a folder: " + "; ".join(f"{k.name} ({k.marks})" for k in FOLDERS)
+KNOWN = f"an MCAP file, {_SINGLE}"
 """All formats, for people."""
 
 

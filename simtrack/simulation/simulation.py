@@ -273,7 +273,7 @@ class Simulation:
         if self.renderer != "mujoco":
             scans.result()
         if "camera" in self._sensors:
-            self._feed.send(self.calibration.apply(self._take_image(target, want_rgb)), target)
+            self._send(self._take_image(target, want_rgb), target)
             self._draws = self._worker.submit(self._draw_noise)
         scans.result()
         return self._feed.receive(target)
@@ -392,7 +392,14 @@ class Simulation:
             np.where(np.isfinite(ranges), intensities, 0.0).astype(np.float32), self._T_base_lidar,
             self._counts["lidar"],
         )  # fmt: skip
-        self._feed.send(self.calibration.apply(scan), stamp + self.lidar.period)
+        self._send(scan, stamp + self.lidar.period)
+
+    def _send(self, frame: RgbdFrame | LidarScan, complete: int) -> None:
+        """Send a frame that is complete at a stamp. Where its clock is ahead it has taken so long on its way: what
+        arrives is never from the future.
+        """
+        told = self.calibration.apply(frame)
+        self._feed.send(told, complete + max(0, told.stamp - frame.stamp))
 
     # ---------------------------------------------------------------------------------------------------------- the end
 

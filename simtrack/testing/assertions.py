@@ -20,7 +20,8 @@ _COMPARISONS: Mapping[str, Callable[[float, float], bool]] = {
     ">=": operator.ge, "<=": operator.le, "==": operator.eq, ">": operator.gt, "<": operator.lt,
 }  # fmt: skip
 _GRAMMAR = re.compile(r"(?:(median|worst|mean)\s+)?([\w.-]+)\s*(>=|<=|==|>|<)\s*(\S+)\s*(mm|cm|deg|ms)?")
-_UNITS = {"": 1.0, "mm": 1e-3, "cm": 1e-2, "ms": 1e-3, "deg": np.pi / 180}
+_UNITS = {"": (1.0, ""), "mm": (1e-3, "m"), "cm": (1e-2, "m"), "ms": (1e-3, "s"), "deg": (np.pi / 180, "rad")}
+"""By what a number is multiplied, and the unit of the metrics that it may be given for."""
 TOLERANCE = 0.05
 """Share by which a median may be worse than a stored one, significantly or not."""
 
@@ -62,6 +63,9 @@ class Bound:
     metric: str
     sign: str
     limit: float
+    """In the metric's own unit."""
+    unit: str = ""
+    """As it was given."""
 
     @staticmethod
     def of(text: str) -> "Bound":
@@ -73,11 +77,22 @@ class Bound:
         match = _GRAMMAR.fullmatch(text.strip())
         try:
             over, metric, sign, number, unit = match.groups(default="") if match else ("",) * 5
-            limit = float(number) * _UNITS[unit]
+            limit = float(number) * _UNITS[unit][0]
         except ValueError as error:
             allowed = "[median|mean|worst] METRIC >= NUMBER [mm|cm|deg|ms], with >=, <=, ==, > or <"
             raise InvalidValueError("expression", text, allowed) from error
-        return Bound(text, over or "median", metric, sign, limit)
+        return Bound(text, over or "median", metric, sign, limit, unit)
+
+    def check_unit(self, unit: str) -> None:
+        """Whether the metric, which has this unit, can have been meant; raises InvalidValueError."""
+        if self.unit and _UNITS[self.unit][1] != unit:
+            fitting = [name for name, (_, of) in _UNITS.items() if of == unit and name]
+            allowed = f"{self.metric} in {' or '.join(fitting)}" if fitting else f"{self.metric} without a unit"
+            raise InvalidValueError("expression", self.text, allowed)
+
+    def told(self, value: float) -> str:
+        """A value of the metric in the unit of the expression."""
+        return f"{value / _UNITS[self.unit][0]:.6g} {self.unit}".strip()
 
     def value(self, values: Sequence[float]) -> float:
         """What is compared with the limit."""
@@ -104,7 +119,7 @@ def assert_metrics(runs: Runs, *expressions: str, seeds: int = 1) -> None:
 
     Raises:
         AssertionError: a bound does not hold, or its metric could not be measured.
-        InvalidValueError: an expression cannot be read, or no run has such a metric.
+        InvalidValueError: an expression cannot be read or has another unit than its metric, or no run has the metric.
         SimtrackError: a run failed.
     """
     __tracebackhide__ = True
@@ -113,12 +128,13 @@ def assert_metrics(runs: Runs, *expressions: str, seeds: int = 1) -> None:
     broken = []
     for bound in bounds:
         values = values_of(found, bound.metric)
+        bound.check_unit(next(metrics[bound.metric].unit for metrics in found.values() if bound.metric in metrics))
         missing = [
             f"seed {seed}: not measured ({found[seed][bound.metric].reason})" for seed in found if seed not in values
         ]
         if missing or not bound.holds(list(values.values())):
-            told = [f"seed {seed}: {value:.6g}" for seed, value in values.items()] + missing
-            measured = f"{bound.value(list(values.values())):.6g}" if values else "nothing"
+            told = [f"seed {seed}: {bound.told(value)}" for seed, value in values.items()] + missing
+            measured = bound.told(bound.value(list(values.values()))) if values else "nothing"
             broken.append(f"{bound.text}: {bound.over} is {measured} ({', '.join(told)})")
     assert not broken, "; ".join(broken)
 

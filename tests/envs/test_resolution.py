@@ -3,7 +3,7 @@ import pytest
 
 from simtrack.contracts import CameraIntrinsics
 from simtrack.envs.resolution import noise_in_small_images, stack_config
-from simtrack.perception.pipeline import StackConfig
+from simtrack.perception.stack_config import StackConfig
 from simtrack.sensors.depth_noise import PRESETS, apply_depth_noise
 
 

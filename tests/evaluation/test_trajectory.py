@@ -35,6 +35,18 @@ def test_a_wrong_heading_is_a_rotation_error() -> None:
     assert drive((0.0, 0.0, 0.02)).metrics()["localization.rotation_rmse"].value == pytest.approx(0.02)
 
 
+def test_what_was_believed_before_the_first_scans_were_matched_is_no_error() -> None:
+    evaluator = TrajectoryEvaluator(since=5 * TENTH)
+    for k in range(30):
+        status, off = (Status.DEGRADED, 0.5) if k < 3 else (Status.OK, 0.01)
+        evaluator.observe(k * TENTH, Localization(k * TENTH, transform_planar(off, 0, 0), np.eye(6), status), np.eye(4))
+    metrics = evaluator.metrics()
+    assert metrics["localization.ate_max"].value == pytest.approx(0.01)
+    assert metrics["localization.rpe.translation.rmse"].value == pytest.approx(0.0, abs=1e-9)
+    assert metrics["localization.first_trusted"].value == pytest.approx(0.3)
+    assert metrics["localization.trusted_share"].value == pytest.approx(0.9)
+
+
 def test_short_runs_say_why_something_is_missing() -> None:
     metrics = drive((0.0, 0.0, 0.0), frames=3).metrics()
     assert metrics["localization.rpe.translation.median"].value is None

@@ -27,7 +27,8 @@ from simtrack.geometry.transforms import transform
 from simtrack.objects.tiago import tiago
 from simtrack.perception import beside
 from simtrack.perception.beside import NICENESS, Beside, Paced, worker
-from simtrack.perception.pipeline import PerceptionStack, StackConfig
+from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.stack_config import StackConfig
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 
 K = CameraIntrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)

@@ -220,6 +220,17 @@ def test_faults_reach_the_frames(small_scene: MakeScene) -> None:
         assert joints.positions[joints.names.index("head_1_joint")] == pytest.approx(0.05, abs=1e-4)
 
 
+def test_what_a_fast_clock_stamps_arrives_when_its_time_has_come(small_scene: MakeScene) -> None:
+    faults = EXACT | {"calibration": {"camera_time_offset": 0.05}}
+    with Simulation(small_scene(sensors=faults), seed=0, renderer="embree") as simulation:
+        images = []
+        for _ in range(6):
+            arrived = [f for f in advance(simulation, 1) if isinstance(f, RgbdFrame)]
+            assert all(frame.stamp <= simulation.now < frame.stamp + simulation.camera_period for frame in arrived)
+            images += arrived
+        assert [frame.stamp - 50_000_000 for frame in images] == [k * simulation.camera_period for k in range(1, 5)]
+
+
 @pytest.mark.parametrize("seed", [1])
 def test_the_hand_moves_things_as_asked(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Picks, carries, puts down gently and pushes; never throws."""

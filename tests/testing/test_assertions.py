@@ -36,6 +36,15 @@ def test_a_broken_bound_tells_every_seed() -> None:
         assert_metrics(runs(), "loop.gaze_gain > 0")
 
 
+def test_a_unit_has_to_fit_its_metric_and_values_are_told_in_it() -> None:
+    with pytest.raises(InvalidValueError, match=r"tracking\.recall without a unit"):
+        assert_metrics(runs(), "tracking.recall >= 5 mm")
+    with pytest.raises(InvalidValueError, match="in mm or cm"):
+        assert_metrics(runs(), "localization.ate_rmse <= 1 deg")
+    with pytest.raises(AssertionError, match=r"median is 4 mm \(seed 0: 4 mm\)"):
+        assert_metrics(runs(), "localization.ate_rmse <= 1 mm")
+
+
 @pytest.mark.parametrize("text", ["tracking.recall", "tracking.recall => 1", "recall >= many", "best recall > 1"])
 def test_an_expression_that_is_none_is_refused(text: str) -> None:
     with pytest.raises(InvalidValueError, match="METRIC"):

@@ -14,6 +14,7 @@ from typing import Literal, TypeAlias
 from simtrack.contracts import Command
 from simtrack.errors import InvalidValueError, SimtrackError
 from simtrack.evaluation.closed_loop import ClosedLoopRun
+from simtrack.evaluation.instrument.belongings import belongings
 from simtrack.evaluation.instrument.conditions import Conditions
 from simtrack.evaluation.metrics import Metrics, read_metrics, write_atomically
 from simtrack.evaluation.run_config import ORACLE, RunConfig, plain, versions
@@ -59,11 +60,15 @@ class Case:
 
     @property
     def key(self) -> str:
-        """Hash of all that the outcome depends on: these fields, the scene's file, the code, versions of libraries."""
+        """Hash of all that the outcome depends on: these fields, the scene's file, the code, users' code and files (see
+        `belongings`), versions of libraries.
+        """
         content = {name: value for name, value in asdict(self).items() if name not in ("threads", "follows")}
         content["follows"] = None if self.follows is None else self.follows.key
-        content["file"] = plain(load_scene(self.scene).model_dump(mode="json"))
+        scene = load_scene(self.scene)
+        content["file"] = plain(scene.model_dump(mode="json"))
         content["code"], content["versions"] = code_digest(), versions()
+        content["belongings"] = belongings((self.tracker, self.localizer, self.detector), scene.mjcf_path)
         return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
     def folder(self, work: Path) -> Path:

@@ -23,6 +23,8 @@ from simtrack.geometry.transforms import is_rigid
 
 RIGID = 1e-4
 """Largest deviation of a rotation matrix from an orthonormal one, so that float32 will do."""
+FAR = 100.0
+"""Metres from the camera at which no object is seen: whoever puts one there means millimetres."""
 
 
 def track_at(
@@ -94,6 +96,8 @@ def _wrong_track(track: object, stamp: int, classes: Collection[str]) -> str:
     for field in ("T_map_object", "T_camera_object"):
         if reason := _wrong_pose(getattr(track, field)):
             return f"{name}: {field} {reason}"
+    if (distance := float(np.linalg.norm(track.T_camera_object[:3, 3]))) > FAR:
+        return f"{name}: T_camera_object lies {distance:.0f} m away; metres are asked for: are these millimetres?"
     if reason := _wrong_covariance(track.covariance):
         return f"{name}: {reason}"
     if np.shape(track.velocity) != (6,) or not np.isfinite(track.velocity).all():

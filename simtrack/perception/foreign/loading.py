@@ -69,8 +69,13 @@ def build_stage(stage: str, given: str, context: StageContext | None = None) -> 
 
     """
     if given.startswith(EXEC):
-        command = _command(stage, given)
-        return ProcessTracker(command, {} if context is None else context.models)
+        program = ProcessTracker(_command(stage, given), {} if context is None else context.models)
+        try:
+            program.start()
+        except (OSError, ValueError) as error:
+            program.close()
+            raise StageError(stage, given, f"is not ready: {error}") from error
+        return program
     maker = _maker(stage, given)
     parts = _parts(stage, given, maker, context)
     try:

@@ -6,9 +6,12 @@ little-endian float32 files, whose path the line names.
 
 import json
 import shutil
+import signal
 import subprocess
 import tempfile
+import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
@@ -17,10 +20,13 @@ import numpy as np
 from simtrack.contracts import Float64, PoseHypothesis, RgbdFrame, Status, Track, TrackerResult, TrackStatus
 from simtrack.objects import ObjectModel
 from simtrack.perception.foreign.answers import track_at
+from simtrack.perception.foreign.watch import WrongAnswerError
 
 PROTOCOL = "simtrack-tracker-1"
 MAX_LINE = 10_000_000
 """Characters of one answer."""
+START_LIMIT = 60.0
+"""Seconds that a program may take until it is ready, before the run."""
 MAX_STARTS = 4
 """How often a program is started in a run, the first time included; one that ends more often stays away."""
 
@@ -52,7 +58,7 @@ class ProcessTracker:
 
         Raises:
             OSError: the program cannot be started, has ended, or does not read.
-            ValueError: its answer is not what the protocol asks for; says which field.
+            WrongAnswerError: its answer is not what the protocol asks for; says which field.
 
         """
         self._asking = True
@@ -61,6 +67,31 @@ class ProcessTracker:
         finally:
             self._asking = False
         return _result(answer, frame, T_map_camera)
+
+    def start(self, limit: float = START_LIMIT) -> None:
+        """Start the program and wait until it is ready: what it loads at first shall not cost it images.
+
+        Raises:
+            OSError: it cannot be started, has ended, or has not said that it is ready within `limit` seconds.
+            WrongAnswerError: it said something else.
+        """
+        late = threading.Event()
+
+        def stop() -> None:
+            late.set()
+            if self._process is not None:
+                self._process.kill()
+
+        timer = threading.Timer(limit, stop)
+        timer.start()
+        try:
+            self._running()
+        except OSError as error:
+            if late.is_set():
+                raise TimeoutError(f'it did not say {{"type": "ready"}} within {limit:g} s') from error
+            raise
+        finally:
+            timer.cancel()
 
     def _ask(
         self, frame: RgbdFrame, T_map_camera: Float64, covariance: Float64, hypotheses: Sequence[PoseHypothesis]
@@ -123,7 +154,7 @@ class ProcessTracker:
         ]  # fmt: skip
         _say(process, {"type": "models", "protocol": PROTOCOL, "models": models})
         if (answer := self._hear(process)).get("type") != "ready":
-            raise ValueError(f'the answer to the models has to be {{"type": "ready"}}, not {answer!r:.200}')
+            raise WrongAnswerError(f'the answer to the models has to be {{"type": "ready"}}, not {answer!r:.200}')
         return process
 
     def _models_folder(self) -> Path:
@@ -140,14 +171,21 @@ class ProcessTracker:
         assert process.stdout is not None
         line = process.stdout.readline(MAX_LINE)
         if not line:
-            raise ChildProcessError(f"the program has ended with exit code {process.wait()}")
+            raise ChildProcessError(f"the program has ended with {_ending(process.wait())}")
         try:
             answer = json.loads(line)
         except ValueError as error:
-            raise ValueError(f"the answer is not JSON: {line[:120]!r}") from error
+            raise WrongAnswerError(f"the answer is not JSON: {line[:120]!r}") from error
         if not isinstance(answer, dict):
-            raise ValueError(f"the answer is not a JSON object: {line[:120]!r}")
+            raise WrongAnswerError(f"the answer is not a JSON object: {line[:120]!r}")
         return answer
+
+
+def _ending(code: int) -> str:
+    """An exit code in words; negative ones are signals."""
+    with suppress(ValueError):
+        return f"signal {signal.Signals(-code).name}"
+    return f"exit code {code}"
 
 
 def _say(process: subprocess.Popen[str], message: Mapping[str, object]) -> None:
@@ -174,23 +212,39 @@ def _hypothesis(h: PoseHypothesis) -> dict[str, object]:
 def _result(answer: Mapping[str, object], frame: RgbdFrame, T_map_camera: Float64) -> TrackerResult:
     stamp, tracks = answer.get("stamp"), answer.get("tracks")
     if not isinstance(stamp, int) or not isinstance(tracks, list):
-        raise ValueError("an answer needs an integer 'stamp' and a list 'tracks'")
+        raise WrongAnswerError("an answer needs an integer 'stamp' and a list 'tracks'")
     return TrackerResult(stamp, tuple(_track(entry, frame, T_map_camera) for entry in tracks), Status.OK)
 
 
 def _track(entry: object, frame: RgbdFrame, T_map_camera: Float64) -> Track:
     if not isinstance(entry, dict):
-        raise ValueError(f"an entry of 'tracks' is not an object: {entry!r:.100}")
-    try:
-        return track_at(
-            frame, T_map_camera, entry["id"], str(entry["class"]),
-            np.array(entry["T_camera_object"], dtype=float).reshape(4, 4),
-            status=TrackStatus(entry.get("status", TrackStatus.CONFIRMED)),
-            translation_sigma=float(entry.get("translation_sigma", 0.005)),
-            rotation_sigma=float(entry.get("rotation_sigma", 0.05)),
-            score=float(entry.get("score", 0.9)),
-        )  # fmt: skip
-    except KeyError as error:
-        raise ValueError(f"a track has no {error}; it needs id, class, T_camera_object") from error
-    except TypeError as error:
-        raise ValueError(f"a track has an entry of the wrong type: {error}") from error
+        raise WrongAnswerError(f"an entry of 'tracks' is not an object: {entry!r:.100}")
+    for field in ("id", "class", "T_camera_object"):
+        if field not in entry:
+            raise WrongAnswerError(f"a track has no '{field}'; it needs id, class, T_camera_object")
+    status = entry.get("status", TrackStatus.CONFIRMED.value)
+    if status not in set(TrackStatus):
+        raise WrongAnswerError(f"a track's status is {status!r}; allowed: {', '.join(TrackStatus)}")
+    return track_at(
+        frame, T_map_camera, entry["id"], str(entry["class"]), _matrix(entry["T_camera_object"]),
+        status=TrackStatus(status),
+        translation_sigma=_number(entry, "translation_sigma", 0.005),
+        rotation_sigma=_number(entry, "rotation_sigma", 0.05),
+        score=_number(entry, "score", 0.9),
+    )  # fmt: skip
+
+
+def _matrix(value: object) -> Float64:
+    """(4, 4) of 16 numbers, row by row."""
+    with suppress(TypeError, ValueError):
+        found = np.array(value, dtype=float)
+        if found.size == 16 and np.isfinite(found).all():
+            return found.reshape(4, 4)
+    raise WrongAnswerError(f"a track's T_camera_object is not 16 finite numbers: {value!r:.100}")
+
+
+def _number(entry: Mapping[str, object], field: str, default: float) -> float:
+    value = entry.get(field, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise WrongAnswerError(f"a track's {field} is no number: {value!r:.100}")
+    return float(value)

@@ -1,18 +1,22 @@
 """Calls with a time limit: what a foreign stage raises, answers too late or answers wrongly becomes a fault."""
 
 import threading
+import traceback
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from queue import SimpleQueue
 from typing import TypeVar
 
+import simtrack
 from simtrack.errors import InvalidValueError
 
 T = TypeVar("T")
 _TEXT = 300
 """Characters of a message that are kept."""
+_PACKAGE = Path(simtrack.__file__).parent
 
 
 class FaultKind(StrEnum):
@@ -23,6 +27,10 @@ class FaultKind(StrEnum):
     """No answer within the limit, or the stage was still at work on an earlier frame."""
     INVALID = "invalid"
     """NaN, no rigid transform, an old stamp, an unknown class or the wrong type."""
+
+
+class WrongAnswerError(ValueError):
+    """A stage answered, and its answer cannot be used: says which field, and what it has to be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +94,9 @@ class Watch:
             else:
                 self._note(stamp, FaultKind.LATE, f"no answer within {self.limit:g} s")
             return None
+        except WrongAnswerError as error:
+            self._note(stamp, FaultKind.INVALID, str(error)[:_TEXT])
+            return None
         except KeyboardInterrupt:  # of this thread: the user stops the run
             raise
         except BaseException as error:  # whatever it raises, `sys.exit` included, is its failure and not the run's
@@ -113,6 +124,10 @@ class Watch:
 
 
 def _told(error: BaseException) -> str:
-    """Type and first line of an error."""
+    """Type and first line of an error, and where in the stage's code it was raised."""
     text = str(error).strip().partition("\n")[0]
-    return (f"{type(error).__name__}: {text}" if text else type(error).__name__)[:_TEXT]
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if not Path(frame.filename).is_relative_to(_PACKAGE)]
+    place = f" ({Path(own[-1].filename).name}:{own[-1].lineno}, in {own[-1].name})" if own else ""
+    told = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return told[: _TEXT - len(place)] + place

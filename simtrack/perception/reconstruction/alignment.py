@@ -8,7 +8,6 @@ model, so that what has no planes is aligned too; and sides of the box behind wh
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -145,8 +144,18 @@ class AlignmentProblem:
 
 def solve(problem: AlignmentProblem, start: Float64) -> Float64:
     """(4,) unknowns where Eq. 12 is least, by Levenberg-Marquardt (More, 1978) from `start`."""
-    from scipy.optimize import least_squares
+    from scipy.optimize import leastsq
 
-    jacobian: Any = problem.jacobian
-    found = least_squares(problem.residuals, start, jac=jacobian, method="lm", max_nfev=20, xtol=1e-7, ftol=1e-7)
-    return found.x if np.isfinite(found.x).all() else start
+    at, found = start, problem.evaluated(start)
+
+    def evaluated(unknowns: Float64, part: int) -> Float64:
+        nonlocal at, found
+        if not np.array_equal(unknowns, at):  # derivatives are asked for where the residuals were
+            at, found = unknowns.copy(), problem.evaluated(unknowns)
+        return found[part]
+
+    result = leastsq(
+        evaluated, start, args=(0,), Dfun=lambda unknowns, _: evaluated(unknowns, 1),
+        full_output=True, maxfev=20, xtol=1e-7, ftol=1e-7, gtol=1e-8, diag=np.ones(len(start)),
+    )  # fmt: skip
+    return result[0] if np.isfinite(result[0]).all() else start

@@ -9,6 +9,7 @@ stays as its own mesh, and a finding says so.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -123,7 +124,7 @@ def reconstruct(
         graph: contact graph of entities with meshes.
         config: thresholds.
         name: of the scene.
-        shortlist: matches and aligns; sections 4.2 and 4.3 if None.
+        shortlist: matches and aligns, called from several threads; sections 4.2 and 4.3 if None.
         known: entity -> its candidates where they are known beforehand, as of tracked objects.
         progress: called between steps.
 
@@ -177,27 +178,41 @@ def _shortlists(
     say: Progress,
     notes: list[Note],
 ) -> dict[str, Sequence[CadCandidate]]:
-    """Candidates of every entity but layout, parents before children; its own mesh for what has none."""
-    out: dict[str, Sequence[CadCandidate]] = {}
+    """Candidates of every entity but layout, parents before children; its own mesh for what has none.
+
+    Entities are matched beside each other, on as many threads as numba has: none needs another's candidates.
+    """
+    import numba
+
     lacking: list[str] = []
     entities = [name for name in graph.descendants() if not is_layout(graph.nodes[name])]
-    for number, name in enumerate(entities):
-        say(f"matching {name}", 0.8 * number / len(entities))
-        node = graph.nodes[name]
-        if known.get(name):
-            out[name] = known[name]
-            continue
+    begun: dict[str, Future[Sequence[CadCandidate]]] = {}
+    with ThreadPoolExecutor(numba.get_num_threads(), initializer=numba.set_num_threads, initargs=(1,)) as workers:
+        for name in entities:
+            node = graph.nodes[name]
+            if known.get(name):
+                continue
+            try:
+                begun[name] = workers.submit(shortlist, node, graph, cad_models(node.semantic_class))
+            except UnknownNameError:
+                lacking.append(name)
+                message = f"there is no model of the class '{node.semantic_class}'; its own mesh stands for it"
+                notes.append(Note(NoteCode.NO_MODEL, name, message))
         try:
-            found = tuple(shortlist(node, graph, cad_models(node.semantic_class)))
-            if not found:
-                message = f"no model of the class '{node.semantic_class}' could be aligned; its own mesh stands for it"
-                notes.append(Note(NoteCode.NO_CANDIDATE, name, message))
-        except UnknownNameError:
-            found = ()
-            lacking.append(name)
-            message = f"there is no model of the class '{node.semantic_class}'; its own mesh stands for it"
-            notes.append(Note(NoteCode.NO_MODEL, name, message))
-        out[name] = found or _own(node, notes)
+            for number, name in enumerate(begun):
+                say(f"matching {name}", 0.8 * number / len(begun))
+                begun[name].result()
+        except BaseException:  # Ctrl-C too: what is not begun shall not be waited for
+            workers.shutdown(wait=False, cancel_futures=True)
+            raise
+    out: dict[str, Sequence[CadCandidate]] = {}
+    for name in entities:
+        node = graph.nodes[name]
+        out[name] = tuple(begun[name].result()) if name in begun else known.get(name, ())
+        if name in begun and not out[name]:
+            message = f"no model of the class '{node.semantic_class}' could be aligned; its own mesh stands for it"
+            notes.append(Note(NoteCode.NO_CANDIDATE, name, message))
+        out[name] = out[name] or _own(node, notes)
     if lacking:
         message = f"there are models of the classes {', '.join(cad_classes())}; see $SIMTRACK_CAD for more"
         notes.append(Note(NoteCode.NO_MODEL, "", message))

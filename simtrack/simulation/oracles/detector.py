@@ -120,15 +120,18 @@ class OracleDetector:
         models: Mapping[str, ObjectModel],
         seed: int,
         config: OracleDetectorConfig | None = None,
+        clock_offset: float = 0.0,
     ) -> None:
+        """`clock_offset`: seconds by which images are stamped late; what is in them is what was there before."""
         self._truth, self._models, self._seed = truth, dict(models), seed
         self.config = config or OracleDetectorConfig()
+        self._clock_offset = round(clock_offset * NANOSECONDS)
 
     def detect(self, frame: RgbdFrame, regions: Sequence[RegionOfInterest] = ()) -> DetectionResult:
         """Detect the objects in the image of a frame; neither its pixels nor the regions are looked at."""
         rng = np.random.default_rng([self._seed, frame.stamp % (1 << 62)])
-        scene = self._truth.at(frame.stamp)
-        visibility = self._truth.visibility(frame.stamp)
+        taken = frame.stamp - self._clock_offset
+        scene, visibility = self._truth.at(taken), self._truth.visibility(taken)
         T_camera_map = inverse(scene.T_map_camera)
         found: list[Detection] = []
         for name in sorted(scene.objects):

@@ -1,5 +1,6 @@
 """Stages of others: what cannot be loaded is said, what goes wrong on a frame is a missed frame with its reason."""
 
+import json
 import re
 import sys
 import threading
@@ -49,6 +50,7 @@ DOCS = Path(__file__).parents[3] / "docs"
 K = CameraIntrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
 T_MAP_CAMERA = perturb(np.eye(4), np.array([1.0, 2.0, 0.5, 0.1, 0.4, -0.2]))
 T_CAMERA_OBJECT = perturb(np.eye(4), np.array([0.05, 0.02, 1.0, 0.3, 0.1, 0.2]))
+FAR_OFF = perturb(np.eye(4), np.array([50.0, 20.0, 1000.0, 0.3, 0.1, 0.2]))
 HYPOTHESIS = PoseHypothesis("relay", 0, T_CAMERA_OBJECT, np.eye(6) * 1e-4, 1.0, 0.8)
 PERIOD = 33_333_333
 
@@ -105,6 +107,7 @@ WRONG = {
     "none": (lambda f, t: None, FaultKind.INVALID, "NoneType"),
     "old": (lambda f, t: TrackerResult(0, (), Status.OK), FaultKind.INVALID, "the stamp is 0"),
     "old track": (changed(stamp=0), FaultKind.INVALID, "track 1: the stamp is 0"),
+    "millimetres": (changed(T_camera_object=FAR_OFF), FaultKind.INVALID, "1001 m away; metres are asked for"),
     "nan": (changed(T_camera_object=np.full((4, 4), np.nan)), FaultKind.INVALID, "T_camera_object is not finite"),
     "scaled": (changed(T_map_object=np.diag([2.0, 2, 2, 1])), FaultKind.INVALID, "no rigid transform"),
     "flat": (changed(T_map_object=np.zeros(16)), FaultKind.INVALID, "not a (4, 4) array"),
@@ -364,11 +367,39 @@ def test_a_program_that_ends_or_babbles_misses_frames(tmp_path: Path, context: S
     results = [update(guarded, number) for number in range(5)]
     guarded.close()
     assert [len(result.tracks) for result in results] == [1, 0, 0, 0, 1]
-    assert [fault.kind for fault in guarded.watch.faults] == [FaultKind.RAISED] * 3
+    assert [f.kind for f in guarded.watch.faults] == [FaultKind.RAISED, FaultKind.INVALID, FaultKind.INVALID]
     for fault, message in zip(guarded.watch.faults, ("exit code 7", "not JSON", "no 'T_camera_object'"), strict=True):
         assert message in fault.message
     write_faults(tmp_path / "faults.csv", guarded.watch.faults)
     assert len((tmp_path / "faults.csv").read_text().splitlines()) == 4
+
+
+def test_a_program_is_ready_before_the_run(tmp_path: Path, context: StageContext, models) -> None:
+    with pytest.raises(StageError, match="is not ready: the program has ended with exit code 3"):
+        build_stage("tracker", f"exec:{sys.executable} -c 'raise SystemExit(3)'", context)
+    sleeps = ProcessTracker([sys.executable, "-c", "import time; time.sleep(600)"], models)
+    with pytest.raises(TimeoutError, match=r"within 0\.2 s"):
+        sleeps.start(limit=0.2)
+    sleeps.close()
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"T_camera_object": [1.0] * 12}, "T_camera_object is not 16 finite numbers"),
+        ({"score": "high"}, "score is no number: 'high'"),
+        ({"status": "great"}, "status is 'great'; allowed: "),
+    ],
+)
+def test_answers_that_cannot_be_used_name_the_field(entry: dict, message: str, models, tmp_path: Path) -> None:
+    track = {"id": 1, "class": "relay", "T_camera_object": np.eye(4).ravel().tolist()} | entry
+    answers = '{"type": "ready"}', json.dumps({"stamp": 0, "tracks": [track]})
+    (tmp_path / "program.py").write_text("".join(f"input()\nprint({answer!r})\n" for answer in answers) + "input()")
+    guarded = GuardedTracker(ProcessTracker([sys.executable, "-u", str(tmp_path / "program.py")], models), models)
+    update(guarded, 0)
+    guarded.close()
+    assert [fault.kind for fault in guarded.watch.faults] == [FaultKind.INVALID], guarded.watch.faults
+    assert message in guarded.watch.faults[0].message
 
 
 def test_a_program_that_hangs_is_ended(tmp_path: Path, models) -> None:
