@@ -23,6 +23,9 @@ class EntityConfig:
 
     least_weight: float = 0.05
     """1/m^2: voxels of less weight (one reading at a metre has 1) count as unseen."""
+    least_held: float = 0.4
+    """m^2: support of the surface of a thing over its weight (medians) below which it is dropped. Where a surface was
+    often seen and seldom told to be this, masks reached over it; at 2 m it is a tenth of the readings."""
     least_support: float = 0.25
     """Share of the support that the surface of a thing has in the middle (median) below which a part of it is dropped:
     masks that reached over its border leave a fringe ..."""
@@ -30,7 +33,7 @@ class EntityConfig:
     """... unless it has so much."""
     least_observed: int = 3
     """Observations of one of its segments that must agree on what an entity is; what fewer say is dropped."""
-    least_area: float = 0.002
+    least_area: float = 0.006
     """Square metres; smaller entities are dropped."""
     gap: float = 0.06
     """Metres between pieces of a thing that hang together."""
@@ -38,6 +41,8 @@ class EntityConfig:
     """Pieces of a thing with less than this share of the area of its largest are dropped: they are other things'."""
 
     def __post_init__(self) -> None:
+        if not 0.0 <= self.least_held < 1e6:
+            raise InvalidValueError("EntityConfig.least_held", self.least_held, "0 or more")
         if not 1 <= self.least_observed <= 1000:
             raise InvalidValueError("EntityConfig.least_observed", self.least_observed, "1 to 1000")
         for name in ("least_weight", "least_area", "gap", "enough_support"):
@@ -77,6 +82,8 @@ class Surface:
     """(F,), of segments as voxels carry them; 0 = none."""
     support: npt.NDArray[np.int16]
     """(F,), observations for the label less those for others."""
+    weights: Float32
+    """(F,), 1/m^2 summed over images."""
 
     @property
     def mesh(self) -> Mesh:
@@ -95,11 +102,13 @@ def extract_surface(volume: Volume, least_weight: float) -> Surface:
     points, tints = np.empty((found, 3), np.float32), np.empty((found, 3), np.uint8)
     kernels.vertices(*arguments, points, tints)
     corners, owners = np.empty((3 * found, 4), np.int32), np.empty(3 * found, np.int32)
-    backing = np.empty(3 * found, np.int16)
-    found = kernels.quads(around, volume.distances, volume.labels, volume.support, cells, corners, owners, backing)
-    corners, owners, backing = corners[:found], owners[:found], backing[:found]
+    backing, seen = np.empty(3 * found, np.int16), np.empty(3 * found, np.float32)
+    found = kernels.quads(
+        around, volume.distances, volume.labels, volume.support, volume.weights, cells, corners, owners, backing, seen
+    )
+    corners, owners, backing, seen = corners[:found], owners[:found], backing[:found], seen[:found]
     faces = np.stack([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
-    return Surface(points, tints, faces, np.repeat(owners, 2), np.repeat(backing, 2))
+    return Surface(points, tints, faces, np.repeat(owners, 2), np.repeat(backing, 2), np.repeat(seen, 2))
 
 
 def extract_entities(
@@ -135,6 +144,8 @@ def extract_entities(
         faces = order[bounds[k] : bounds[k + 1]]
         if name not in STUFF_FIRST and len(faces):
             support = surface.support[faces]
+            if np.median(support) < config.least_held * np.median(surface.weights[faces]):
+                continue
             faces = faces[support >= min(config.least_support * np.median(support), config.enough_support)]
         mesh = _part(surface, faces)
         if name not in STUFF_FIRST and config.least_piece > 0.0:

@@ -102,7 +102,7 @@ def vertices(around, keys, distances, weights, colors, voxel, least, cells, poin
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def quads(around, distances, labels, support, cells, corners, owners, backing):
+def quads(around, distances, labels, support, weights, cells, corners, owners, backing, seen):
     """Quads across all edges between voxels that the surface crosses, counter-clockwise seen from before the surface.
 
     Args:
@@ -110,10 +110,12 @@ def quads(around, distances, labels, support, cells, corners, owners, backing):
         distances: (C, 512) float32, metres.
         labels: (C, 512) int32.
         support: (C, 512) int16, observations for the label less those for others.
+        weights: (C, 512) float32, 1/m^2.
         cells: from `vertices`.
         corners: (Q, 4) int32, output.
         owners: (Q,) int32, output: label of the end of the edge that is nearer to the surface.
         backing: (Q,) int16, output: support of that label there.
+        seen: (Q,) float32, output: weight there.
 
     Returns:
         Number of quads, of which the first Q are written.
@@ -157,5 +159,6 @@ def quads(around, distances, labels, support, cells, corners, owners, backing):
                             here_first = labels[block, n] > 0 if here_first else labels[b, m] <= 0
                             owners[found] = labels[block, n] if here_first else labels[b, m]
                             backing[found] = support[block, n] if here_first else support[b, m]
+                            seen[found] = weights[block, n] if here_first else weights[b, m]
                         found += 1
     return found
