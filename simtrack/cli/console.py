@@ -60,14 +60,25 @@ def show_warning(
     console.print(Text.assemble(("warning: ", "bold yellow"), str(message)))
 
 
+_LEAST_TEXT = 20
+"""Characters of a column of text that are not given away to the others."""
+
+
 def show_table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: Sequence[int] = ()) -> None:
-    """Print a table; `right` are the columns to be aligned right."""
+    """Print a table; `right` are the columns to be aligned right. Too wide, it folds text and headers, not numbers."""
     from rich.table import Table
     from rich.text import Text
 
+    rows = list(rows)
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     for k, column in enumerate(columns):
-        table.add_column(column, justify="right" if k in right else "left", overflow="fold", no_wrap=k in right)
+        longest = max((len(str(row[k])) for row in rows), default=0)
+        if k in right and longest:  # its header may be folded
+            table.add_column(
+                column, justify="right", overflow="fold", min_width=longest, no_wrap=len(column) <= longest
+            )
+        else:
+            table.add_column(column, overflow="fold", min_width=min(longest, _LEAST_TEXT))
     for row in rows:
         table.add_row(*(cell if isinstance(cell, Text) else Text(str(cell)) for cell in row))
     out().print(table)

@@ -209,10 +209,10 @@ class ClosedLoopRun:
         config = self.config
         self.started = time.monotonic() if self.started is None else self.started
         set_threads(config.threads)
+        folder = RunFolder(config.out, config.overwrite)  # before anything that takes long
         with ExitStack() as exits:
             exits.enter_context(ThreadPoolExecutor(1)).submit(warm_up, opengl=config.renderer == "mujoco")
             stop = exits.enter_context(StopSignal())
-            folder = RunFolder(config.out, config.overwrite)
             folder.write_config(config.resolved())
             estimates = exits.enter_context(EstimateTables(folder.path))
             classes = [thing.model for thing in config.scene.objects]

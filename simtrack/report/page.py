@@ -9,7 +9,7 @@ import numpy as np
 
 import simtrack
 from simtrack.contracts import NANOSECONDS
-from simtrack.evaluation.metrics import write_atomically
+from simtrack.evaluation.metrics import Metric, write_atomically
 from simtrack.evaluation.record import (
     CameraPicture,
     Interval,
@@ -83,6 +83,8 @@ def render(record: RunRecord) -> str:
     return page.render(
         record=record,
         version=simtrack.__version__,
+        stages_run=_stages(record.config),
+        warnings=_missed(record.metrics),
         seconds=(record.end - record.start) / NANOSECONDS,
         cards=[card for name, label in CARDS if (card := _card(record, name, label, targets)) is not None],
         headline=table(record.metrics, [n for n in targets if n in record.metrics], targets),
@@ -104,6 +106,26 @@ def render(record: RunRecord) -> str:
         stages=figures.stage_times(record),
         config=_config_text(record.config),
     )
+
+
+def _stages(config: Mapping[str, object]) -> str:
+    """Whose stages were measured, in words."""
+    given = [(stage.replace("_", " "), config.get(stage)) for stage in ("tracker", "localizer", "scene_graph")]
+    foreign = [f"{stage} {name}" for stage, name in given if name]
+    return " · ".join([*(foreign or ["simtrack's stages"]), f"detector {config.get('detector', 'of the recording')}"])
+
+
+def _missed(metrics: Mapping[str, Metric]) -> list[str]:
+    """What is to be said of foreign stages that missed frames."""
+    said = []
+    for name, metric in sorted(metrics.items()):
+        stage, _, what = name.removeprefix("foreign.").partition(".")
+        if name.startswith("foreign.") and what == "missed_frames" and metric.value:
+            of = metrics[name.removesuffix("missed_frames") + "frames"].value
+            said.append(
+                f"The {stage.replace('_', ' ')} missed {metric.value} of {of} frames ({metric.reason}): see faults.csv."
+            )
+    return said
 
 
 def template(name: str) -> "Template":

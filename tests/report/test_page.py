@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from simtrack.contracts import CameraIntrinsics, Relation, StaticMap
-from simtrack.evaluation.metrics import measured, unmeasured
+from simtrack.evaluation.metrics import Metric, measured, unmeasured
 from simtrack.evaluation.record import Interval, RunRecord
 from simtrack.evaluation.targets import Target
 from simtrack.geometry.meshes import box_mesh
@@ -79,6 +79,18 @@ def test_a_run_that_measured_nothing_still_gets_a_page(tmp_path) -> None:
     nothing = StaticMap(np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32))
     write_report(RunRecord("mine", 0, nothing, {}, {}), tmp_path / "report.html")
     assert "mine" in (tmp_path / "report.html").read_text()
+
+
+def test_a_foreign_stage_and_what_it_missed_stand_on_top(record: RunRecord, page: str) -> None:
+    assert "simtrack&#39;s stages" in page
+    metrics = record.metrics | {
+        "foreign.tracker.frames": Metric(60, "1"),
+        "foreign.tracker.missed_frames": Metric(3, "1", "frames 4-6"),
+    }
+    other = render(replace(record, config=record.config | {"tracker": "mine:Tracker"}, metrics=metrics))
+    assert "tracker mine:Tracker" in other
+    assert "The tracker missed 3 of 60 frames (frames 4-6)" in other
+    assert "The tracker missed" not in page
 
 
 def test_names_are_escaped(record: RunRecord) -> None:
