@@ -24,6 +24,8 @@ from simtrack.cli.replay import replay
 from simtrack.cli.run import run
 from simtrack.cli.scenes import scenes
 from simtrack.cli.score import score
+from simtrack.cli.serve import serve
+from simtrack.cli.survey import survey
 from simtrack.cli.sweep import sweep
 from simtrack.cli.train import train
 from simtrack.cli.trials import trials
@@ -44,6 +46,8 @@ VERBS = {
     "validate": validate,
     "train": train,
     "map": map_command,
+    "survey": survey,
+    "serve": serve,
     "reconstruct": reconstruct,
     "check": check,
     "scenes": scenes,

@@ -9,6 +9,8 @@ if TYPE_CHECKING:
     from simtrack.evaluation.closed_loop import Observer, Progress
     from simtrack.evaluation.record import RunRecord
 
+SURVEY = "survey"
+
 
 def run(
     scene: Annotated[str, tyro.conf.Positional] = "workbench",
@@ -22,6 +24,7 @@ def run(
     scene_graph: str | None = None,
     stage_limit: float = 5.0,
     given: str = "",
+    map: str | None = None,
     renderer: Literal["mujoco", "embree"] = "mujoco",
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
     compare_gaze: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
@@ -47,6 +50,8 @@ def run(
         scene_graph: What says how things stand to each other, of yours, package.module:Class.
         stage_limit: Seconds that a stage of yours has for a frame; after that the frame counts as missed.
         given: Conditions: noise=2,occlusion=3 (see docs/instrument.md).
+        map: What the robot is localized in: survey, simulated scans that are fused to a mesh, or the folder of such a
+            survey that `simtrack survey` made; by default the true surface, displaced.
         renderer: mujoco needs OpenGL (EGL), embree needs none.
         overwrite: Replace the results in an existing folder.
         compare_gaze: Run the fixed gaze on the same seed, too: what does the agent's gaze gain?
@@ -64,7 +69,7 @@ def run(
     from simtrack.evaluation.run_config import RunConfig
     from simtrack.report.page import write_report
     from simtrack.simulation.oracles import OracleDetectorConfig
-    from simtrack.simulation.scene_file import load_scene
+    from simtrack.simulation.scene_file import load_scene, surveyed_by
 
     loaded, oracle = load_scene(scene), OracleDetectorConfig()
     if given:
@@ -72,11 +77,14 @@ def run(
 
         conditions = parse_conditions(given)
         loaded, oracle = conditions.scene(loaded), conditions.detector(oracle)
+    if map == SURVEY:
+        loaded, map = surveyed_by(loaded, "scans"), None
     folder = out if out is not None else Path("runs") / f"{loaded.name}-{seed}"
     config = RunConfig(
         scene=loaded, out=folder, duration=duration, seed=seed, agent=agent, detector=detector, renderer=renderer,
         overwrite=overwrite, log=log, compare_gaze=compare_gaze, threads=threads,
         tracker=tracker, localizer=localizer, scene_graph=scene_graph, stage_limit=stage_limit, oracle=oracle,
+        static_map=None if map is None else Path(map),
     )  # fmt: skip
     observers = _observers(view, rrd)
     with console.ProgressLine(f"{loaded.name} · seed {seed}") as line, cold_start_told(line.say):

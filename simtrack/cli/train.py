@@ -1,5 +1,6 @@
-"""``simtrack train``: let the detector's networks learn from a generated data set, or an agent from what it does."""
+"""``simtrack train``: let networks of detector and segmenter learn from a data set, or an agent from what it does."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,28 +12,29 @@ if TYPE_CHECKING:
 
 
 def train(
-    what: Annotated[Literal["detector", "agent"], tyro.conf.Positional],
+    what: Annotated[Literal["detector", "segmenter", "agent"], tyro.conf.Positional],
     out: Path,
     data: Path | None = None,
     minutes: float | None = None,
     seed: int = 0,
     part: Literal["both", "boxes", "keypoints"] = "both",
 ) -> int:
-    """Let the detector or an agent learn. The same command carries on where it was stopped.
+    """Let networks or an agent learn. The same command carries on where it was stopped.
 
     The detector's networks learn from a generated data set: boxes.onnx and keypoints.onnx, which `simtrack run
-    --detector DIR` takes (extra train). An agent learns by PPO where to look in ActivePerception, from what is
-    believed: `simtrack env ActivePerception --policy DIR` lets it play (extra rl).
+    --detector DIR` takes (extra train). The segmenter's is segments.onnx, which `simtrack map --segmenter DIR` takes
+    (extra train). An agent learns by PPO where to look in ActivePerception, from what is believed: `simtrack env
+    ActivePerception --policy DIR` lets it play (extra rl).
 
     Args:
         what: What learns.
         out: Folder for checkpoints, logs and networks.
-        data: For the detector: folder of a data set that `simtrack generate` made, with the format bop among its
-            writers.
-        minutes: Of computing time for each network, over all calls; if not given, until it has learned (the detector)
+        data: For networks: folder of a data set that `simtrack generate` made, of a recipe with the format bop among
+            its writers for the detector, rooms_panoptic for the segmenter.
+        minutes: Of computing time for each network, over all calls; if not given, until it has learned (a network)
             or 30 (an agent).
         seed: Of everything random.
-        part: Both networks at once, a process each, or one of them.
+        part: Of the detector: both networks at once, a process each, or one of them.
     """
     import importlib.util
 
@@ -48,6 +50,8 @@ def train(
     missing = [name for name in ("torch", "onnx") if importlib.util.find_spec(name) is None]
     if missing:
         raise StageError(what, str(data), f"{', '.join(missing)} not installed; pip install 'simtrack[train]'")
+    if what == "segmenter":
+        return _segmenter(data, out, minutes, seed)
     config = TrainingConfig(data, out, minutes, seed)
     with console.ProgressLine(f"train {what}", "reading the data set") as line:
         prepared(config, lambda done, of: line.show(f"{done}/{of} scenes made ready", done / of))
@@ -92,6 +96,19 @@ def _train_agent(out: Path, minutes: float, seed: int) -> int:
     return 0
 
 
+def _segmenter(data: Path, out: Path, minutes: float | None, seed: int) -> int:
+    from simtrack.cli import console
+    from simtrack.training.segmenter import SegmenterTraining, train_segmenter
+
+    try:
+        path = train_segmenter(SegmenterTraining(data, out, minutes, seed), _shown("segments"))
+    except KeyboardInterrupt:
+        console.show_error("stopped: the same command carries on from the last checkpoint")
+        return 130
+    console.show_written(out, [path.name])
+    return 0
+
+
 def _together(parts: "tuple[Part, ...]", config: "TrainingConfig") -> None:
     """A process each; raises what one of them raised."""
     import multiprocessing
@@ -105,6 +122,11 @@ def _together(parts: "tuple[Part, ...]", config: "TrainingConfig") -> None:
 def _train(part: "Part", config: "TrainingConfig") -> None:
     from simtrack.training.detector import train_part
 
+    train_part(part, config, _shown(part))
+
+
+def _shown(part: str) -> "Callable[[Progress], None]":
+    """Prints how a training fares, now and then and when it was measured."""
     last: dict[str, float] = {}
 
     def show(progress: "Progress") -> None:
@@ -115,4 +137,4 @@ def _train(part: "Part", config: "TrainingConfig") -> None:
             last.clear()
             last.update(progress.figures)
 
-    train_part(part, config, show)
+    return show

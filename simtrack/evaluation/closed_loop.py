@@ -46,6 +46,7 @@ from simtrack.simulation.agents import AgentContext, make_agent
 from simtrack.simulation.oracles import OracleDetector, OracleLocalizer
 from simtrack.simulation.randomness import stream
 from simtrack.simulation.simulation import Simulation
+from simtrack.simulation.survey_files import read_survey
 
 if TYPE_CHECKING:
     from simtrack.recordings import McapWriter
@@ -145,6 +146,8 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
     """Simulation, stack and agent of a run, wired up; with a log of the feed if the configuration names a file."""
     with ExitStack() as exits:
         simulation = exits.enter_context(Simulation(config.scene, config.seed, renderer=config.renderer))
+        if config.static_map is not None:
+            simulation.use_map(read_survey(config.static_map))
         robot = config.scene.robot
         start = Command(head_pan=robot.head_pan, head_tilt=robot.head_tilt, torso=robot.torso)
         rng = stream(config.seed, "agent")

@@ -55,7 +55,10 @@ class MappedScene:
 
 
 def map_scene(
-    source: MapSource, config: PanopticMapConfig | None = None, progress: Callable[[int, int], None] | None = None
+    source: MapSource,
+    config: PanopticMapConfig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    onto: PanopticMap | None = None,
 ) -> MappedScene:
     """Fuse all frames of a source into a map.
 
@@ -63,15 +66,23 @@ def map_scene(
         source: of the frames; it is released afterwards.
         config: of the map.
         progress: hears how many frames of how many are done.
+        onto: a map that is carried on, in the place of a new one.
     """
-    return map_scenes(source, [config or PanopticMapConfig()], progress)[0]
+    maps = [PanopticMap(config or PanopticMapConfig()) if onto is None else onto]
+    return _fused(source, maps, progress)[0]
 
 
 def map_scenes(
     source: MapSource, configs: Sequence[PanopticMapConfig], progress: Callable[[int, int], None] | None = None
 ) -> tuple[MappedScene, ...]:
     """Fuse all frames of a source into several maps, which get the same segments; see `map_scene`."""
-    maps, seconds = [PanopticMap(config) for config in configs], np.zeros(len(configs))
+    return _fused(source, [PanopticMap(config) for config in configs], progress)
+
+
+def _fused(
+    source: MapSource, maps: Sequence[PanopticMap], progress: Callable[[int, int], None] | None
+) -> tuple[MappedScene, ...]:
+    seconds = np.zeros(len(maps))
     seen = None if source.room is None else SeenSurface(source.room, maps[0].config.max_depth)
     T_map_first: Float64 | None = None
     with source.held:

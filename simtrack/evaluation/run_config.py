@@ -16,6 +16,7 @@ from simtrack.perception.stack_config import StackConfig
 from simtrack.simulation.agents import AGENTS
 from simtrack.simulation.oracles import OracleDetectorConfig
 from simtrack.simulation.scene_file import SceneFile
+from simtrack.simulation.survey_files import check_survey
 
 ORACLE = "oracle"
 """The detector that knows the truth, and errs like a trained network; the localizer that knows it and does not err."""
@@ -56,6 +57,8 @@ class RunConfig:
     """Run the fixed gaze on the same seed, too."""
     threads: int | None = None
     """Threads of the compiled kernels; all that there are if None."""
+    static_map: Path | None = None
+    """Folder of a survey that the robot is localized in; None: the scene's own."""
     stack: StackConfig = field(default_factory=StackConfig)
     script: tuple[Command, ...] | None = None
     """Commands, one a camera period, that are given instead of the agent's: those of another run, to repeat its way."""
@@ -79,6 +82,8 @@ class RunConfig:
             raise InvalidValueError("stage_limit", self.stage_limit, "more than 0 and at most 3600 seconds")
         for stage, given in self.foreign.items():
             check_stage(stage, given)
+        if self.static_map is not None:
+            check_survey(self.static_map)
 
     @property
     def seconds(self) -> float:
@@ -112,6 +117,7 @@ class RunConfig:
             "tracker": self.tracker,
             "localizer": self.localizer,
             "scene_graph": self.scene_graph,
+            "static_map": None if self.static_map is None else str(self.static_map),
             "oracle": plain(asdict(self.oracle)),
             "stage_limit": self.stage_limit,
             "renderer": self.renderer,

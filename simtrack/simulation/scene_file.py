@@ -305,6 +305,13 @@ def load_scene(name_or_path: str | Path) -> SceneFile:
     return scene if not colon else with_building_seed(scene, int(seed))
 
 
+def surveyed_by(scene: SceneFile, method: str) -> SceneFile:
+    """The scene, its map made by a method of `simtrack.simulation.survey.SurveyConfig`."""
+    changed = scene.model_copy(update={"survey": {**scene.survey, "method": method}})
+    changed._path = scene.path
+    return changed
+
+
 def with_building_seed(scene: SceneFile, seed: int) -> SceneFile:
     """The same scene with the building of a fixed seed."""
     fixed = scene.model_copy(update={"static": scene.static.model_copy(update={"seed": seed})})

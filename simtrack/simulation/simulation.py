@@ -207,6 +207,10 @@ class Simulation:
             self._static_map = survey(self.world.static, config, stream(self._building, "survey"))
         return self._static_map
 
+    def use_map(self, static_map: StaticMap) -> None:
+        """Give estimators this map in the place of the survey of the building."""
+        self._static_map = static_map
+
     @property
     def models(self) -> dict[str, ObjectModel]:
         """The tracker's imperfect models of the scene's catalogue objects, by model name."""

@@ -6,6 +6,7 @@ furniture was moved, carried away or brought in.
 """
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from simtrack.geometry.transforms import apply, exp_so3, inverse, transform
 from simtrack.simulation.building.cache import cached_map, world_digest
 from simtrack.simulation.building.parts import StaticPart, StaticWorld
 from simtrack.simulation.retessellation import retessellated
+from simtrack.simulation.survey_scans import scanned_parts
 
 SCANNER_HEIGHT = 1.0
 """Metres: what faces down below this height was seen by no scanner."""
@@ -59,8 +61,12 @@ class SurveyConfig:
     """Least and largest distance that moved furniture was moved, metres."""
     turn: float = 1.0
     """Largest angle that it was turned by, radians."""
+    method: Literal["displaced", "scans"] = "displaced"
+    """The true surface, displaced; or one that simulated scans were fused to (`simtrack.simulation.survey_scans`)."""
 
     def __post_init__(self) -> None:
+        if self.method not in ("displaced", "scans"):
+            raise InvalidValueError("SurveyConfig.method", self.method, "displaced, scans")
         for name in ("moved", "brought", "removed"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"SurveyConfig.{name}", getattr(self, name), "0 to 1")
@@ -126,6 +132,9 @@ def _articulations(world: StaticWorld, config: SurveyConfig, rng: np.random.Gene
 
 def _surveyed(world: StaticWorld, config: SurveyConfig, rng: np.random.Generator) -> StaticMap:
     parts = as_surveyed(world, config, rng)
+    if config.method == "scans":
+        scanned = scanned_parts(world, parts, rng, config.max_faces)
+        return _static_map(world, [part for part, _ in scanned], [mesh for _, mesh in scanned], config.noise)
     edge = config.edge if config.edge is not None else _edge_for(parts, config.max_faces)
     meshes = [_scanned(part, edge, rng) for part in parts]
     counts = np.cumsum([len(mesh.vertices) for mesh in meshes])[:-1]
@@ -134,13 +143,18 @@ def _surveyed(world: StaticWorld, config: SurveyConfig, rng: np.random.Generator
         _simplified(replace_vertices(mesh, vertices), part)
         for mesh, vertices, part in zip(meshes, np.split(whole.vertices, counts), parts, strict=True)
     ]
-    result = concatenate(displaced)
+    return _static_map(world, parts, displaced, config.noise)
+
+
+def _static_map(world: StaticWorld, parts: list[StaticPart], meshes: list[Mesh], noise: float) -> StaticMap:
+    """The map of parts as their meshes show them."""
+    result = concatenate(meshes)
     return StaticMap(
         vertices=result.vertices.astype(np.float32),
         faces=result.faces,
-        entities=tuple(_entity(part, mesh) for part, mesh in zip(parts, displaced, strict=True)),
+        entities=tuple(_entity(part, mesh) for part, mesh in zip(parts, meshes, strict=True)),
         rooms=world.rooms,
-        noise=config.noise,
+        noise=noise,
     )
 
 

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,10 @@ from torch import nn  # pyright: ignore[reportMissingImports] - extra `train`
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection.bins import BEFORE, BINS
 from simtrack.perception.detection.views import CHANNELS, WINDOW
+from simtrack.perception.segmentation.panoptic_network import CHANNELS as SCENE_CHANNELS
+from simtrack.perception.segmentation.panoptic_network import MULTIPLE
 from simtrack.training.networks import BoxNetwork, KeypointNetwork
+from simtrack.training.segment_network import Answering
 from simtrack.training.shards import IMAGE_HEIGHT, IMAGE_WIDTH
 
 KEY = "simtrack"
@@ -42,6 +46,15 @@ def export_keypoints(network: nn.Module, models: tuple[ObjectModel, ...], sigma_
     about = {"kind": "keypoints", "size": size, "window": WINDOW, "bins": BINS, "before": BEFORE}
     about["sigma_scale"] = round(sigma_scale, 3)
     _export(network, inputs, names[:2], names[2:], {name: {0: "n"} for name in names}, about | _classes(models), path)
+
+
+def export_segments(network: nn.Module, classes: Sequence[str], path: Path) -> None:
+    """Write a panoptic network: ``shown`` (1, 10, H, W) to ``classes``, ``heat`` and ``offsets`` (1, ..., H/4, W/4)."""
+    shown = torch.zeros(1, SCENE_CHANNELS, 2 * MULTIPLE, 2 * MULTIPLE)
+    about = {"kind": "segments", "channels": SCENE_CHANNELS, "classes": list(classes)}
+    names = ["shown", "classes", "heat", "offsets"]
+    free = {"shown": {2: "height", 3: "width"}, **{name: {2: "rows", 3: "columns"} for name in names[1:]}}
+    _export(Answering(network), (shown,), names[:1], names[1:], free, about, path)
 
 
 def _classes(models: tuple[ObjectModel, ...]) -> dict[str, Any]:

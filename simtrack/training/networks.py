@@ -37,7 +37,7 @@ class Residual(nn.Module):
         return functional.relu(x + self.norm(self.second(self.first(x))))
 
 
-def _stage(channels_in: int, channels_out: int, blocks: int) -> nn.Sequential:
+def halved(channels_in: int, channels_out: int, blocks: int) -> nn.Sequential:
     """Half the resolution, then residual blocks."""
     return nn.Sequential(
         convolved(channels_in, channels_out, stride=2), *(Residual(channels_out) for _ in range(blocks))
@@ -54,8 +54,8 @@ class BoxNetwork(nn.Module):
 
     def __init__(self, classes: int) -> None:
         super().__init__()
-        self.stem = nn.Sequential(convolved(CHANNELS, 16, stride=2), _stage(16, 32, 1))
-        self.fine, self.middle, self.coarse = _stage(32, 64, 2), _stage(64, 128, 2), _stage(128, 192, 1)
+        self.stem = nn.Sequential(convolved(CHANNELS, 16, stride=2), halved(16, 32, 1))
+        self.fine, self.middle, self.coarse = halved(32, 64, 2), halved(64, 128, 2), halved(128, 192, 1)
         self.from_coarse, self.from_middle = nn.Conv2d(192, 64, 1), nn.Conv2d(128, 64, 1)
         self.joined = nn.Sequential(convolved(64, 64), Residual(64))
         self.heat, self.sides = nn.Conv2d(64, classes, 1), nn.Conv2d(64, 4, 1)
@@ -85,7 +85,7 @@ class KeypointNetwork(nn.Module):
         super().__init__()
         self.bins = bins
         self.stem = nn.Sequential(convolved(CHANNELS, 24, stride=2), Residual(24))
-        self.fine, self.middle, self.coarse = _stage(24, 48, 2), _stage(48, 96, 2), _stage(96, 160, 2)
+        self.fine, self.middle, self.coarse = halved(24, 48, 2), halved(48, 96, 2), halved(96, 160, 2)
         self.told_middle, self.told_coarse = nn.Linear(classes + 2, 96), nn.Linear(classes + 2, 160)
         cells = (self.size // 16) ** 2
         self.hidden = nn.Sequential(nn.Linear(160 * cells + classes + 2, 320), nn.ReLU(inplace=True))

@@ -1,11 +1,13 @@
 """Average precision of boxes, as COCO defines it at one overlap."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
 
 from simtrack.contracts import Float64
 from simtrack.perception.detection.boxes import Box, overlap
+from simtrack.perception.segmentation.panoptic_network import STUFF
 
 
 def average_precision(
@@ -52,3 +54,39 @@ def average_precision(
             steps = np.searchsorted(recall, np.linspace(0.0, 1.0, 101), side="left")
             values[c] = float(np.append(envelope, 0.0)[steps].mean())
     return values
+
+
+def panoptic_quality(
+    pairs: Sequence[tuple[np.ndarray, Sequence[str], np.ndarray, Sequence[str]]], stuff: Sequence[str] = STUFF
+) -> dict[str, float]:
+    """Class -> PQ in percent (Kirillov et al., CVPR 2019) of segments in images, of classes that are truly there.
+
+    Args:
+        pairs: for every image found segments (H, W), from 1, 0 = none, with their classes, and entities (H, W) from 0,
+            -1 = nothing, with theirs.
+        stuff: classes of which an image has one segment.
+    """
+    overlap: dict[str, float] = defaultdict(float)
+    matched: dict[str, int] = defaultdict(int)
+    either: dict[str, int] = defaultdict(int)
+    there: set[str] = set()
+    for found, found_classes, entities, classes in pairs:
+        first = {name: list(classes).index(name) for name in stuff if name in classes}
+        merged = np.array([*(first.get(name, k) for k, name in enumerate(classes)), -1])[entities]
+        known = merged >= 0  # where nothing is known, nothing is wrong
+        table = np.bincount(
+            found[known] * len(classes) + merged[known], minlength=(len(found_classes) + 1) * len(classes)
+        ).reshape(-1, len(classes))
+        sizes, true_sizes = table.sum(axis=1), table.sum(axis=0)
+        for number, name in enumerate(found_classes, start=1):
+            either[name] += int(sizes[number] > 0)
+        for k in np.flatnonzero(true_sizes).tolist():
+            name = classes[k]
+            there.add(name)
+            either[name] += 1
+            for number in np.flatnonzero(table[1:, k]).tolist():
+                union = sizes[number + 1] + true_sizes[k] - table[number + 1, k]
+                if found_classes[number] == name and 2 * table[number + 1, k] > union:
+                    overlap[name] += float(table[number + 1, k] / union)
+                    matched[name] += 1
+    return {name: 200.0 * overlap[name] / max(either[name], 1) for name in sorted(there)}

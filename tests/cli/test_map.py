@@ -33,6 +33,10 @@ def test_a_recording_with_poses_is_mapped(real_data: Path, tmp_path: Path) -> No
         (["rooms:1", "--sensor", "polaroid"], "kinect_v2"),
         (["rooms:1", "--voxel", "9"], "VolumeConfig.voxel"),
         (["nowhere"], "unknown scene"),
+        (["rooms:1", "--segmenter", "http://127.0.0.1:9"], "simtrack serve segmenter"),
+        (["rooms:1", "--segmenter", "mine"], "package.module:Class"),
+        (["rooms:1", "--swap", "1"], "reach of the readings"),
+        (["rooms:1", "--onto", "nowhere"], "no map that can be read"),
     ],
 )
 def test_what_cannot_be_mapped_is_refused(
@@ -45,3 +49,17 @@ def test_what_cannot_be_mapped_is_refused(
 def test_an_evaluation_of_nonsense_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "panoptic", "--strength", "-1", "--out", str(tmp_path / "out")]) == 2
     assert "strength" in capsys.readouterr().err
+
+
+def test_a_service_that_cannot_listen_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve", "segmenter", "--port", "99999"]) == 2
+    assert "65535" in capsys.readouterr().err
+    assert main(["serve", "segmenter", "--segmenter", "nowhere:Class"]) == 2
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_a_run_on_a_survey_that_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "workbench", "--map", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
+    assert "simtrack survey" in " ".join(capsys.readouterr().err.split())
+    assert main(["survey", "nowhere", "--out", str(tmp_path / "out")]) == 2
+    assert not list(tmp_path.iterdir())

@@ -15,9 +15,11 @@ from simtrack.errors import StageError
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.objects import ObjectModel
 from simtrack.perception.foreign.process_tracker import ProcessTracker
+from simtrack.perception.segmentation.panoptic import Segmenter
 
 PROTOCOLS: Mapping[str, type] = {
     "tracker": Tracker, "localizer": Localizer, "detector": Detector, "scene graph": SceneGraphBuilder,
+    "segmenter": Segmenter,
 }  # fmt: skip
 EXEC = "exec:"
 
@@ -46,7 +48,7 @@ def check_stage(stage: str, given: str) -> None:
     """Whether a stage can be loaded, before anything is built.
 
     Args:
-        stage: ``tracker``, ``localizer``, ``detector`` or ``scene graph``.
+        stage: ``tracker``, ``localizer``, ``detector``, ``scene graph`` or ``segmenter``.
         given: ``package.module:Class``, or ``exec:program`` for a tracker.
 
     Raises:
@@ -59,7 +61,7 @@ def check_stage(stage: str, given: str) -> None:
         _maker(stage, given)
 
 
-def build_stage(stage: str, given: str, context: StageContext) -> object:
+def build_stage(stage: str, given: str, context: StageContext | None = None) -> object:
     """The stage, made by what `given` names; its constructor gets the fields of `context` that it has parameters for.
 
     Raises:
@@ -67,7 +69,7 @@ def build_stage(stage: str, given: str, context: StageContext) -> object:
 
     """
     if given.startswith(EXEC):
-        program = ProcessTracker(_command(stage, given), context.models)
+        program = ProcessTracker(_command(stage, given), {} if context is None else context.models)
         try:
             program.start()
         except (OSError, ValueError) as error:
@@ -154,9 +156,9 @@ def _is_method(name: str, part: object) -> bool:
     return not name.startswith("_") and inspect.isfunction(part)
 
 
-def _parts(stage: str, given: str, maker: Callable[..., object], context: StageContext) -> dict[str, object]:
+def _parts(stage: str, given: str, maker: Callable[..., object], context: StageContext | None) -> dict[str, object]:
     """Arguments for the constructor."""
-    offered = {field.name: getattr(context, field.name) for field in fields(StageContext)}
+    offered = {} if context is None else {field.name: getattr(context, field.name) for field in fields(StageContext)}
     try:
         parameters = inspect.signature(maker).parameters.values()
     except (TypeError, ValueError):
@@ -168,7 +170,7 @@ def _parts(stage: str, given: str, maker: Callable[..., object], context: StageC
         if parameter.name in offered and parameter.kind is not parameter.POSITIONAL_ONLY:
             chosen[parameter.name] = offered[parameter.name]
         elif parameter.default is parameter.empty:
-            reason = f"its constructor asks for '{parameter.name}'; there are: {', '.join(offered)}"
+            reason = f"its constructor asks for '{parameter.name}'; there are: {', '.join(offered) or 'none'}"
             raise StageError(stage, given, reason)
     return chosen
 

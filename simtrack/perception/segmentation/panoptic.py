@@ -70,6 +70,6 @@ class PanopticSegments:
 class Segmenter(Protocol):
     """Finds objects and layout in an RGB-D image."""
 
-    def segment(self, frame: RgbdFrame) -> PanopticSegments:
-        """Masks, classes and scores of one image."""
+    def segment(self, frame: RgbdFrame) -> PanopticSegments | None:
+        """Masks, classes and scores of one image; None where the segmenter failed on it."""
         ...

@@ -62,11 +62,11 @@ def cached_map(key: str, build: Callable[[], StaticMap]) -> StaticMap:
     """The survey kept under `key`, else made and kept; a cache that cannot be used is no error."""
     path = paths.cache_dir() / "surveys" / f"{key}.npz"
     with suppress(*UNUSABLE):
-        return _unpack_map(_read(path))
+        return unpack_map(_read(path))
     _log.info("surveying the building")
     static_map = build()
     with suppress(OSError):
-        write_arrays(path, _pack_map(static_map))
+        write_arrays(path, pack_map(static_map))
     return static_map
 
 
@@ -162,7 +162,8 @@ def _unpack_world(arrays: Arrays) -> StaticWorld:
     return StaticWorld(tuple(parts), _unpack_rooms(arrays))
 
 
-def _pack_map(static_map: StaticMap) -> Arrays:
+def pack_map(static_map: StaticMap) -> Arrays:
+    """A survey as named arrays, without its articulations."""
     entities = static_map.entities
     return {
         "text": _pack_text([(e.name, e.semantic_class, e.room) for e in entities]),
@@ -176,7 +177,8 @@ def _pack_map(static_map: StaticMap) -> Arrays:
     }
 
 
-def _unpack_map(arrays: Arrays) -> StaticMap:
+def unpack_map(arrays: Arrays) -> StaticMap:
+    """The survey that `pack_map` packed; KeyError or ValueError if it is something else."""
     supports = _unpack_posed(arrays, "supports")
     entities = tuple(
         MapEntity(name, semantic_class, arrays["T"][k], arrays["extents"][k], room, supports[k])

@@ -1,12 +1,13 @@
 """The panoptic map: surfaces come back, segments keep their labels, counts decide, nonsense changes nothing."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 
-from simtrack.contracts import CameraIntrinsics, Float64, RgbdFrame, Status
+from simtrack.contracts import NANOSECONDS, CameraIntrinsics, Float64, RgbdFrame, Status
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.geometry.meshes import Mesh, box_mesh, face_areas, face_normals
 from simtrack.geometry.transforms import look_at
@@ -14,10 +15,12 @@ from simtrack.perception.mapping.panoptic.association import SegmentLabels
 from simtrack.perception.mapping.panoptic.counts import CountsConfig, JointCounts, Observation, SeparateCounts
 from simtrack.perception.mapping.panoptic.entities import MapEntityMesh, extract_surface
 from simtrack.perception.mapping.panoptic.files import read_entities, write_entities
-from simtrack.perception.mapping.panoptic.frame_segments import FrameFusionConfig, fuse_segments
+from simtrack.perception.mapping.panoptic.frame_segments import SILENT, FrameFusionConfig, fuse_segments
 from simtrack.perception.mapping.panoptic.layout import split_walls
-from simtrack.perception.mapping.panoptic.panoptic_map import PanopticMap, PanopticMapConfig
-from simtrack.perception.mapping.panoptic.volume import Volume, VolumeConfig
+from simtrack.perception.mapping.panoptic.map_file import read_map, write_map
+from simtrack.perception.mapping.panoptic.panoptic_map import Method, PanopticMap, PanopticMapConfig
+from simtrack.perception.mapping.panoptic.regions import SwapConfig
+from simtrack.perception.mapping.panoptic.volume import STORED, Volume, VolumeConfig
 from simtrack.perception.segmentation.panoptic import PanopticSegments
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 
@@ -41,7 +44,7 @@ def views(count: int) -> list[tuple[RgbdFrame, Float64, PanopticSegments]]:
             rgb = np.where(hits.instances.reshape(120, 160, 1) == 1, (200, 40, 40), (90, 90, 90)).astype(np.uint8)
             image = np.where(hits.hit, hits.instances + 1, 0).astype(np.int32).reshape(120, 160)
             segments = PanopticSegments(k, image, ("floor", "box"), np.ones(2, np.float32))
-            seen.append((RgbdFrame(k, depth, rgb, CAMERA, np.eye(4), k), T, segments))
+            seen.append((RgbdFrame(k * NANOSECONDS, depth, rgb, CAMERA, np.eye(4), k), T, segments))
     return seen
 
 
@@ -99,6 +102,22 @@ def test_frames_that_cannot_be_used_are_counted_and_change_nothing(mapped: Panop
         update = mapped.integrate(*bad)
         assert update.status is status and update.reason in mapped.skipped
     assert [mapped.volume.count, mapped.frames, mapped.volume.weights.sum(), len(mapped.labels.canonical)] == before
+
+
+def test_a_pose_that_jumps_is_skipped_unless_the_next_one_confirms_it() -> None:
+    frame, T, segments = views(1)[0]
+    panoptic_map = PanopticMap(PanopticMapConfig.of_method("full", 0.05))
+    there = T.copy()
+    there[0, 3] += 1.0
+
+    def statuses(*poses: Float64) -> list[bool]:
+        stamps = range(panoptic_map.frames, panoptic_map.frames + len(poses))
+        frames = [replace(frame, stamp=round(k * NANOSECONDS / 30)) for k in stamps]
+        return [panoptic_map.integrate(f, p, segments).status is Status.OK for f, p in zip(frames, poses, strict=True)]
+
+    assert statuses(T, T, there, T) == [True, True, False, True]
+    assert statuses(there, there, there) == [False, True, True]
+    assert panoptic_map.skipped == {"the pose jumps": 2} and panoptic_map.frames == 5
 
 
 def test_a_map_that_would_grow_too_large_stays_as_it_was() -> None:
@@ -226,3 +245,151 @@ def test_walls_are_told_apart() -> None:
     split = split_walls([MapEntityMesh("wall1", "wall", 1, 1.0, both)], np.random.default_rng(0))
     sides = {int(np.argmin(entity.mesh.extents[:2])) for entity in split}
     assert sides == {0, 1} and all(min(entity.mesh.extents[:2]) < 0.05 for entity in split)
+
+
+# ----------------------------------------------------------------------------------------------- saved and swapped out
+
+
+def along(count: int) -> list[tuple[RgbdFrame, Float64, PanopticSegments]]:
+    """Three boxes in a row on the ground, seen on the way past them and back."""
+    seen, bundle = [], RayBundle.from_camera(CAMERA)
+    ground = box_mesh((9.0, 2.0, 0.2))
+    with RayScene() as scene:
+        scene.add(TriangleMesh(ground.vertices - [0.0, 0.0, 0.1], ground.faces), instance=0)
+        for number in range(3):
+            scene.add(TriangleMesh(BOX.vertices + [3.0 * number - 3.0, 0.0, 0.0], BOX.faces), instance=number + 1)
+        for k in range(count):
+            x = 3.5 * np.cos(2.0 * np.pi * k / count)
+            T = look_at(np.array([x, -1.0, 0.8]), np.array([x, 0.0, 0.1]))
+            hits = scene.cast(bundle, T, 2.0)
+            depth = np.where(hits.hit, hits.distances, 0.0).astype(np.float32).reshape(120, 160)
+            image = np.where(hits.hit, hits.instances + 1, 0).astype(np.int32).reshape(120, 160)
+            present = np.unique(image[image > 0])
+            numbers = np.zeros(5, np.int32)
+            numbers[present] = np.arange(1, len(present) + 1)
+            classes = tuple("floor" if p == 1 else "box" for p in present.tolist())
+            segments = PanopticSegments(k, numbers[image], classes, np.ones(len(classes), np.float32))
+            seen.append((RgbdFrame(k * NANOSECONDS, depth, None, CAMERA, np.eye(4), k), T, segments))
+    return seen
+
+
+def same_entities(first: PanopticMap, second: PanopticMap) -> bool:
+    a, b = first.entities(), second.entities()
+    assert [e.name for e in a] == [e.name for e in b] and len(a) > 1
+    return all(
+        np.array_equal(x.mesh.vertices, y.mesh.vertices) and np.array_equal(x.mesh.faces, y.mesh.faces)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+def test_what_is_far_is_written_away_and_the_map_is_the_same() -> None:
+    config = replace(PanopticMapConfig.of_method("full", 0.03), max_depth=1.2)
+    swapping = PanopticMap(replace(config, swap=SwapConfig(2.4, region=4, every=2)))
+    kept, most, frames = PanopticMap(config), 0, along(40)
+    with swapping:
+        for frame, T, segments in frames:
+            assert swapping.integrate(frame, T, segments).status is Status.OK
+            kept.integrate(frame, T, segments)
+            most = max(most, swapping.volume.count)
+        assert swapping.regions is not None and swapping.regions.written > 10
+        assert most < 0.85 * kept.volume.count
+        assert same_entities(kept, swapping)
+        for name in STORED:
+            np.testing.assert_array_equal(kept.volume.blocks()[name], swapping.volume.blocks()[name])
+
+
+def test_regions_within_reach_are_not_to_be_written_away() -> None:
+    with pytest.raises(InvalidValueError, match="reach"):
+        PanopticMap(PanopticMapConfig(swap=SwapConfig(1.0)))
+
+
+@pytest.mark.parametrize("method", ["full", "no-joint-fusion"])
+def test_a_map_that_was_saved_is_carried_on_as_if_it_had_not_been(method: Method, tmp_path: Path) -> None:
+    frames = along(12)
+    whole, half = (PanopticMap(PanopticMapConfig.of_method(method, 0.05)) for _ in range(2))
+    for k, (frame, T, segments) in enumerate(frames):
+        whole.integrate(frame, T, segments)
+        if k == 6:
+            write_map(half, tmp_path / "map.npz")
+            half = read_map(tmp_path / "map.npz")
+        half.integrate(frame, T, segments)
+    assert half.config == whole.config and half.frames == whole.frames == 12
+    assert same_entities(whole, half)
+
+
+def test_damaged_maps_are_refused(mapped: PanopticMap, tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    write_map(mapped, path)
+    data = path.read_bytes()
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    for broken in (b"", b"nonsense", data[: len(data) // 2]):
+        path.write_bytes(broken)
+        with pytest.raises(FileFormatError):
+            read_map(path)
+    for name, values in (("labels", arrays["labels"] + 10**6), ("weights", arrays["weights"][:1]),
+                         ("document", np.array("{}")), ("keys", arrays["keys"] * 0)):  # fmt: skip
+        np.savez(path, **{**arrays, name: values})
+        with pytest.raises(FileFormatError):
+            read_map(path)
+
+
+# ------------------------------------------------------------------------ what full evidence asks for in a single frame
+
+
+def flat_scene() -> tuple[np.ndarray, np.ndarray]:
+    """Depth of a wall at 2 m with a bottle 0.3 m before it, and their geometric segments."""
+    depth = np.full((120, 160), 2.0, np.float32)
+    geometric = np.ones((120, 160), np.int32)
+    depth[40:80, 70:85], geometric[40:80, 70:85] = 1.7, 2
+    return depth, geometric
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_what_stands_before_a_wall_and_was_not_found_is_not_wall(flat: bool) -> None:
+    depth, geometric = flat_scene()
+    wall = PanopticSegments(0, np.ones((120, 160), np.int32), ("wall",), np.ones(1, np.float32))
+    fused = fuse_segments(geometric, wall, depth, CAMERA, {"wall"}, FrameFusionConfig(flat=flat))
+    assert fused.instances[fused.image[0, 0]] == 1
+    assert fused.instances[fused.image[60, 77]] == (SILENT if flat else 1)
+
+
+def test_readings_of_a_mask_beside_its_segment_are_filled_and_others_are_not() -> None:
+    depth, geometric = flat_scene()
+    geometric[38:82, 68:87] = 0  # edges that no segment has, the bottle's and the wall's
+    geometric[42:78, 72:83] = 2
+    image = np.ones((120, 160), np.int32)
+    image[40:80, 70:85] = 2
+    panoptic = PanopticSegments(0, image, ("wall", "bottle"), np.ones(2, np.float32))
+    filled = fuse_segments(geometric, panoptic, depth, CAMERA, {"wall"})
+    np.testing.assert_array_equal(filled.instances[filled.image] == 2, image == 2)
+    kept = fuse_segments(geometric, panoptic, depth, CAMERA, {"wall"}, FrameFusionConfig(fill=False))
+    np.testing.assert_array_equal(kept.image > 0, geometric > 0)
+
+
+def test_thin_things_that_no_geometric_segment_has_are_segments() -> None:
+    depth, geometric = flat_scene()
+    geometric[geometric == 2] = 0
+    image = np.where(depth < 1.9, 2, 1).astype(np.int32)
+    panoptic = PanopticSegments(0, image, ("wall", "lamp"), np.ones(2, np.float32))
+    fused = fuse_segments(geometric, panoptic, depth, CAMERA, {"wall"})
+    number = int(fused.image[60, 77])
+    assert fused.instances[number] == 2 and fused.sizes[number] == (image == 2).sum()
+
+
+def test_entities_that_few_frames_speak_for_are_dropped() -> None:
+    frame, T, segments = views(1)[0]
+    panoptic_map = PanopticMap(PanopticMapConfig.of_method("full", 0.03))
+    for expected in (0, 0, 2):
+        assert panoptic_map.integrate(frame, T, segments).status is Status.OK
+        assert len(panoptic_map.entities()) == expected
+
+
+def test_what_is_cut_off_from_a_thing_says_nothing_or_background() -> None:
+    geometric = np.ones((120, 160), np.int32)
+    geometric[:, 110:] = 2
+    depth = np.where(geometric == 2, 2.0, 1.0).astype(np.float32)
+    panoptic = PanopticSegments(0, np.ones((120, 160), np.int32), ("chair",), np.ones(1, np.float32))
+    for silent, expected in ((True, SILENT), (False, 0)):
+        fused = fuse_segments(geometric, panoptic, depth, CAMERA, config=FrameFusionConfig(silent=silent))
+        assert fused.instances[fused.image[0, 150]] == expected

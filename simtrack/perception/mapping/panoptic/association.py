@@ -4,6 +4,7 @@ Section 3.2, first paragraph, and the first half of 3.3 of the reconstruction pa
 """
 
 from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,3 +92,14 @@ class SegmentLabels:
             other = pair[1] if pair[0] == label else into
             if rest != other:
                 self._together[min(rest, other), max(rest, other)] += count
+
+    def state(self) -> list[list[int]]:
+        """Which labels shared segments in how many frames, as plain data: rows of label, label, count."""
+        return [[*pair, count] for pair, count in sorted(self._together.items())]
+
+    def restore(self, state: Iterable[Sequence[int]]) -> None:
+        """Take what `state` told; TypeError or ValueError if it is something else."""
+        together: dict[tuple[int, int], int] = defaultdict(int)
+        for label, other, count in state:
+            together[int(label), int(other)] = int(count)
+        self._together = together

@@ -7,7 +7,7 @@ what the paper compares with: Phi(l, c) and Phi(l, p) by themselves, as in Voxbl
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -59,6 +59,14 @@ class PanopticCounts(Protocol):
 
     def entities(self) -> Mapping[int, SegmentEntity]:
         """Global segment -> what it is part of; background is missing."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """All that was counted, as plain data."""
+        ...
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take what `state` told; KeyError, TypeError or ValueError if it is something else."""
         ...
 
 
@@ -157,6 +165,19 @@ class JointCounts:
         found = ((label, self._entity(label)) for label in sorted(self.phi))
         return {label: entity for label, entity in found if entity is not None}
 
+    def state(self) -> dict[str, Any]:
+        """All that was counted, as plain data."""
+        rows = [[label, c, p, n] for label, counts in sorted(self.phi.items()) for (c, p), n in sorted(counts.items())]
+        return {"phi": rows, "stuff": dict(self._stuff), "fresh": self._fresh}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take what `state` told."""
+        phi: dict[int, dict[tuple[str, int], int]] = defaultdict(dict)
+        for label, name, p, count in state["phi"]:
+            phi[int(label)][str(name), int(p)] = int(count)
+        self._stuff = {str(name): int(p) for name, p in state["stuff"].items()}
+        self.phi, self._fresh = phi, int(state["fresh"])
+
     def _entity(self, label: int) -> SegmentEntity | None:
         classes: dict[str, int] = defaultdict(int)
         counts = self.phi.get(label, {})
@@ -251,6 +272,26 @@ class SeparateCounts:
             )
             for label, p in own.items()
         }  # fmt: skip
+
+    def state(self) -> dict[str, Any]:
+        """All that was counted, as plain data."""
+        return {
+            "classes": [[label, c, n] for label, row in sorted(self.classes.items()) for c, n in sorted(row.items())],
+            "instances": [
+                [label, p, n] for label, row in sorted(self.instances.items()) for p, n in sorted(row.items())
+            ],
+            "fresh": self._fresh,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take what `state` told."""
+        classes: dict[int, dict[str, int]] = defaultdict(dict)
+        instances: dict[int, dict[int, int]] = defaultdict(dict)
+        for label, name, count in state["classes"]:
+            classes[int(label)][str(name)] = int(count)
+        for label, p, count in state["instances"]:
+            instances[int(label)][int(p)] = int(count)
+        self.classes, self.instances, self._fresh = classes, instances, int(state["fresh"])
 
     def _likeliest(self, labels: Iterable[int], taken: Set[int]) -> int:
         for label in labels:

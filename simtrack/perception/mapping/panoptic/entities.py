@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from simtrack.contracts import Float32, Int32, Uint8
 from simtrack.errors import InvalidValueError
@@ -20,15 +21,36 @@ STUFF_FIRST = ("floor", "wall", "ceiling")
 class EntityConfig:
     """Settings of `extract_entities`."""
 
-    least_weight: float = 0.2
+    least_weight: float = 0.05
     """1/m^2: voxels of less weight (one reading at a metre has 1) count as unseen."""
-    least_area: float = 0.002
+    least_held: float = 0.4
+    """m^2: support of the surface of a thing over its weight (medians) below which it is dropped. Where a surface was
+    often seen and seldom told to be this, masks reached over it; at 2 m it is a tenth of the readings."""
+    least_support: float = 0.25
+    """Share of the support that the surface of a thing has in the middle (median) below which a part of it is dropped:
+    masks that reached over its border leave a fringe ..."""
+    enough_support: float = 2.5
+    """... unless it has so much."""
+    least_observed: int = 3
+    """Observations of one of its segments that must agree on what an entity is; what fewer say is dropped."""
+    least_area: float = 0.006
     """Square metres; smaller entities are dropped."""
+    gap: float = 0.06
+    """Metres between pieces of a thing that hang together."""
+    least_piece: float = 0.15
+    """Pieces of a thing with less than this share of the area of its largest are dropped: they are other things'."""
 
     def __post_init__(self) -> None:
-        for name in ("least_weight", "least_area"):
+        if not 0.0 <= self.least_held < 1e6:
+            raise InvalidValueError("EntityConfig.least_held", self.least_held, "0 or more")
+        if not 1 <= self.least_observed <= 1000:
+            raise InvalidValueError("EntityConfig.least_observed", self.least_observed, "1 to 1000")
+        for name in ("least_weight", "least_area", "gap", "enough_support"):
             if not 0.0 < getattr(self, name) < 1e6:
                 raise InvalidValueError(f"EntityConfig.{name}", getattr(self, name), "a finite number > 0")
+        for name in ("least_support", "least_piece"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InvalidValueError(f"EntityConfig.{name}", getattr(self, name), "a share, 0 to 1")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +80,10 @@ class Surface:
     """(F, 3), counter-clockwise seen from the free side."""
     labels: Int32
     """(F,), of segments as voxels carry them; 0 = none."""
+    support: npt.NDArray[np.int16]
+    """(F,), observations for the label less those for others."""
+    weights: Float32
+    """(F,), 1/m^2 summed over images."""
 
     @property
     def mesh(self) -> Mesh:
@@ -66,7 +92,7 @@ class Surface:
 
 
 def extract_surface(volume: Volume, least_weight: float) -> Surface:
-    """The zero set of a volume where it was seen with at least that weight."""
+    """The zero set of a volume where it was seen with at least that weight, 1/m^2."""
     count, voxel = volume.count, volume.config.voxel
     around = kernels.neighbours(volume.keys, volume.table, count)
     cells = np.full(volume.distances[:count].shape, -1, np.int32)
@@ -76,10 +102,13 @@ def extract_surface(volume: Volume, least_weight: float) -> Surface:
     points, tints = np.empty((found, 3), np.float32), np.empty((found, 3), np.uint8)
     kernels.vertices(*arguments, points, tints)
     corners, owners = np.empty((3 * found, 4), np.int32), np.empty(3 * found, np.int32)
-    found = kernels.quads(around, volume.distances, volume.labels, cells, corners, owners)
-    corners, owners = corners[:found], owners[:found]
+    backing, seen = np.empty(3 * found, np.int16), np.empty(3 * found, np.float32)
+    found = kernels.quads(
+        around, volume.distances, volume.labels, volume.support, volume.weights, cells, corners, owners, backing, seen
+    )
+    corners, owners, backing, seen = corners[:found], owners[:found], backing[:found], seen[:found]
     faces = np.stack([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
-    return Surface(points, tints, faces, np.repeat(owners, 2))
+    return Surface(points, tints, faces, np.repeat(owners, 2), np.repeat(backing, 2), np.repeat(seen, 2))
 
 
 def extract_entities(
@@ -98,6 +127,9 @@ def extract_entities(
     parts: dict[tuple[str, int], list[SegmentEntity]] = defaultdict(list)
     for each in entities.values():
         parts[each.semantic_class, each.instance].append(each)
+    sure = {key for key, found in parts.items() if max(e.agreeing for e in found) >= config.least_observed}
+    parts = {key: found for key, found in parts.items() if key in sure}
+    entities = {label: each for label, each in entities.items() if (each.semantic_class, each.instance) in sure}
     keys = sorted(parts, key=lambda key: (key[0] not in STUFF_FIRST, *key))
     number = {key: k for k, key in enumerate(keys)}
     of_label = np.full(len(canonical), -1, np.int32)
@@ -109,7 +141,15 @@ def extract_entities(
     found: list[MapEntityMesh] = []
     running: dict[str, int] = {}
     for k, (name, p) in enumerate(keys):
-        mesh = _part(surface, order[bounds[k] : bounds[k + 1]])
+        faces = order[bounds[k] : bounds[k + 1]]
+        if name not in STUFF_FIRST and len(faces):
+            support = surface.support[faces]
+            if np.median(support) < config.least_held * np.median(surface.weights[faces]):
+                continue
+            faces = faces[support >= min(config.least_support * np.median(support), config.enough_support)]
+        mesh = _part(surface, faces)
+        if name not in STUFF_FIRST and config.least_piece > 0.0:
+            mesh = _large_pieces(mesh, config.gap, config.least_piece)
         if len(mesh.faces) and face_areas(mesh).sum() >= config.least_area:
             running[name] = running.get(name, 0) + 1
             agreeing, observed = sum(e.agreeing for e in parts[name, p]), sum(e.observed for e in parts[name, p])
@@ -123,3 +163,26 @@ def _part(surface: Surface, chosen: np.ndarray) -> Mesh:
     mesh = Mesh(surface.vertices[used].astype(np.float64), faces, surface.colors[used][faces[:, 0]])
     keep = face_areas(mesh) > 0.0
     return mesh if keep.all() else Mesh(mesh.vertices, faces[keep], surface.colors[used][faces[keep, 0]])
+
+
+def _large_pieces(mesh: Mesh, gap: float, least: float) -> Mesh:
+    """A mesh without its pieces that have less than a share of the area of the largest; `gap` metres hold together."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    if not len(mesh.faces):
+        return mesh
+    middles = mesh.triangles.mean(axis=1)
+    _, first, cell = np.unique(np.floor(middles / (0.5 * gap)), axis=0, return_index=True, return_inverse=True)
+    pairs = KDTree(middles[first]).query_pairs(gap, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(first),) * 2)
+    count, piece = connected_components(links, directed=False)
+    of_face = piece[cell.ravel()]
+    areas = np.bincount(of_face, face_areas(mesh), minlength=count)
+    keep = (areas >= least * areas.max())[of_face]
+    if keep.all():
+        return mesh
+    used, faces = np.unique(mesh.faces[keep], return_inverse=True)
+    colors = None if mesh.face_colors is None else mesh.face_colors[keep]
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), colors)

@@ -14,6 +14,9 @@ from simtrack.contracts import CameraIntrinsics, Float32, Float64, Int32
 from simtrack.errors import InvalidValueError
 from simtrack.perception.segmentation.panoptic import PanopticSegments
 
+SILENT = -1
+"""Panoptic segment of a segment of which a frame does not say what it belongs to."""
+
 
 @dataclass(frozen=True, slots=True)
 class FrameFusionConfig:
@@ -21,7 +24,7 @@ class FrameFusionConfig:
 
     split: bool = True
     """Whether panoptic segments are split out of geometric ones."""
-    inside: float = 0.9
+    inside: float = 0.5
     """Share of a panoptic segment that must lie in a geometric one to be split out of it ..."""
     part: float = 0.5
     """... of which it must be less than this share; one with more outside all geometric segments is one by itself."""
@@ -29,17 +32,42 @@ class FrameFusionConfig:
     """Readings, of an image of 640 x 480, that a segment needs which is split out, or which no geometric one covers."""
     covered: float = 0.2
     """Share of a geometric segment that the panoptic one which it takes must cover."""
+    fill: bool = True
+    """Whether readings of a mask that no geometric segment has, as on edges, thin things and at grazing angles, go to
+    the segments of the mask beside them, or make segments of their own."""
+    step: float = 0.02
+    """Share of the depth by which such readings differ from those beside them."""
     cluster: bool = True
     """Whether things keep only their largest cluster."""
+    silent: bool = True
+    """Whether what is cut off from a thing says nothing in this frame, as it may be the leg of a table of which another
+    part is hidden; else it is background, as in the paper."""
     distance: float = 0.05
     """Metres between segments of one cluster."""
+    hidden: tuple[float, float] = (0.4, 0.2)
+    """Metres from the largest cluster, and share of its readings, up to which what is cut off from it is taken for a
+    part of it to which the way is hidden, as the foot of a table is below its top; zeros: never, as in the paper."""
+    flat: bool = True
+    """Whether small segments of stuff that lie off the planes of its large ones say nothing in this frame: what stands
+    before a wall and was not found is not wall."""
+    off_plane: float = 0.04
+    """Metres between such a segment and those planes."""
+    plane_area: float = 0.15
+    """Square metres, seen from the camera, of a segment that is large."""
 
     def __post_init__(self) -> None:
         for name in ("inside", "part", "covered"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"FrameFusionConfig.{name}", getattr(self, name), "a share, 0 to 1")
+        if not 0.0 < self.step < 1.0:
+            raise InvalidValueError("FrameFusionConfig.step", self.step, "a share, above 0 and below 1")
         if not 0.0 < self.distance < 10.0:
             raise InvalidValueError("FrameFusionConfig.distance", self.distance, "metres, above 0 and below 10")
+        if not 0.0 <= min(self.hidden) <= max(self.hidden) < 100.0:
+            raise InvalidValueError("FrameFusionConfig.hidden", self.hidden, "metres and a share, 0 or more")
+        for name in ("off_plane", "plane_area"):
+            if not 0.0 < getattr(self, name) < 100.0:
+                raise InvalidValueError(f"FrameFusionConfig.{name}", getattr(self, name), "above 0 and below 100")
         if self.min_pixels < 1:
             raise InvalidValueError("FrameFusionConfig.min_pixels", self.min_pixels, "1 or more")
 
@@ -51,7 +79,8 @@ class FrameSegments:
     image: Int32
     """(H, W): number of the segment that a reading belongs to, from 1; 0 = none."""
     instances: Int32
-    """(N + 1,): number of the panoptic segment that each one belongs to, 0 = background; entry 0 is not a segment."""
+    """(N + 1,): number of the panoptic segment that each one belongs to, 0 = background, `SILENT` = not to be told;
+    entry 0 is not a segment."""
     sizes: Int32
     """(N + 1,): readings."""
 
@@ -98,10 +127,58 @@ def fuse_segments(
     image = np.where(read, numbers[table].ravel()[pairs], 0).astype(np.int32)
     kept = np.concatenate([[0], np.flatnonzero(sizes > 0)])
     segments = FrameSegments(image, instances[kept], sizes[kept])
+    if config.fill and masks:
+        segments = _filled(segments, panoptic.image, depth, config.step, least)
     if config.cluster and masks:
         things = [k + 1 for k, name in enumerate(panoptic.classes) if name not in stuff]
-        _keep_largest_clusters(segments, panoptic.image, things, depth, intrinsics, config.distance)
+        _keep_largest_clusters(segments, panoptic.image, things, depth, intrinsics, config)
+    if config.flat:
+        for number in (k + 1 for k, name in enumerate(panoptic.classes) if name in stuff):
+            _keep_planes(segments, number, depth, intrinsics, config)
     return segments
+
+
+def _keep_planes(
+    segments: FrameSegments, number: int, depth: Float32, intrinsics: CameraIntrinsics, config: FrameFusionConfig
+) -> None:
+    """Silence the segments of one mask of stuff that lie off the planes of its large segments, in place."""
+    stride = max(1, intrinsics.width // 320)
+    sparse = segments.image[::stride, ::stride]
+    parts = {
+        member: _points(sparse == member, depth, intrinsics, stride, config.distance)
+        for member in np.flatnonzero(segments.instances == number).tolist()
+    }
+    parts = {member: points for member, points in parts.items() if len(points)}
+    pixel = 1.0 / (intrinsics.fx * intrinsics.fy)
+    area = {k: segments.sizes[k] * pixel * float(np.mean(points[:, 2] ** 2)) for k, points in parts.items()}
+    large = [member for member in parts if area[member] >= config.plane_area and len(parts[member]) >= 3]
+    if not large:
+        return
+    planes = [_plane(parts[member]) for member in large]
+    for member in parts.keys() - set(large):
+        off = [float(np.median(np.abs(parts[member] @ normal - level))) for normal, level in planes]
+        if min(off) > config.off_plane:
+            segments.instances[member] = SILENT
+
+
+def _plane(points: Float64) -> tuple[Float64, float]:
+    """Normal and distance from the origin of the plane nearest to points."""
+    middle = points.mean(axis=0)
+    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+    return normal, float(normal @ middle)
+
+
+def _filled(segments: FrameSegments, masks: Int32, depth: Float32, step: float, least: int) -> FrameSegments:
+    """The segments, grown over readings of their masks, and new ones of what is left of those."""
+    from simtrack.perception.mapping.panoptic import fill_kernels as kernels
+
+    image = segments.image
+    kernels.grow_inside(image, segments.instances, masks, depth, np.float32(step))
+    more = kernels.pieces_inside(image, masks, depth, np.float32(step), least, len(segments.instances))
+    instances = np.concatenate([segments.instances, more]).astype(np.int32)
+    sizes = np.bincount(image.ravel(), minlength=len(instances)).astype(np.int32)
+    sizes[0] = 0
+    return FrameSegments(image, instances, sizes)
 
 
 def _extracted(joint: np.ndarray, least: int, config: FrameFusionConfig) -> np.ndarray:
@@ -118,9 +195,9 @@ def _extracted(joint: np.ndarray, least: int, config: FrameFusionConfig) -> np.n
 
 def _keep_largest_clusters(
     segments: FrameSegments, masks: Int32, things: Sequence[int], depth: Float32, intrinsics: CameraIntrinsics,
-    distance: float,
+    config: FrameFusionConfig,
 ) -> None:  # fmt: skip
-    """Send the segments of a thing that are not in its largest cluster to the background, in place.
+    """Take the segments of a thing that are not in its largest cluster out of it, in place.
 
     Readings of its mask that are in no segment, as those on edges, hold segments together too.
     """
@@ -132,11 +209,31 @@ def _keep_largest_clusters(
         if len(members) < 2:
             continue
         masks_of = [sparse == number for number in members.tolist()]
-        points = [_points(chosen, depth, intrinsics, stride, 0.5 * distance) for chosen in masks_of]
-        loose = _points(free & (mask == thing), depth, intrinsics, stride, 0.5 * distance)
-        cluster = _clusters([*points, *loose[:, None]], distance)[: len(members)]
+        cell = 0.5 * config.distance
+        points = [_points(chosen, depth, intrinsics, stride, cell) for chosen in masks_of]
+        loose = _points(free & (mask == thing), depth, intrinsics, stride, cell)
+        cluster = _clusters([*points, *loose[:, None]], config.distance)[: len(members)]
         weight = np.bincount(cluster, segments.sizes[members])
-        segments.instances[members[cluster != weight.argmax()]] = 0
+        main = int(weight.argmax())
+        hidden = _hidden(points, cluster, weight, main, config)
+        segments.instances[members[(cluster != main) & ~hidden[cluster]]] = SILENT if config.silent else 0
+
+
+def _hidden(
+    points: Sequence[Float64], cluster: np.ndarray, weight: np.ndarray, main: int, config: FrameFusionConfig
+) -> np.ndarray:
+    """(K,) bool: clusters that are small and near to the main one."""
+    from scipy.spatial import KDTree
+
+    distance, share = config.hidden
+    small = (weight > 0) & (weight <= share * weight[main])
+    if distance > 0.0 and small.any():
+        tree = KDTree(np.concatenate([p for p, k in zip(points, cluster, strict=True) if k == main]))
+        for number in np.flatnonzero(small).tolist():
+            own = np.concatenate([p for p, k in zip(points, cluster, strict=True) if k == number])
+            near = len(own) and float(tree.query(own, distance_upper_bound=distance)[0].min()) <= distance
+            small[number] = bool(near)
+    return small & (distance > 0.0)
 
 
 def _points(mask: np.ndarray, depth: Float32, intrinsics: CameraIntrinsics, stride: int, cell: float) -> Float64:

@@ -1,13 +1,14 @@
 """The panoptic map: frames in, entities out."""
 
 from dataclasses import dataclass, field, replace
+from types import TracebackType
 from typing import Literal, TypeAlias
 
 import numpy as np
 
-from simtrack.contracts import Float64, Int32, RgbdFrame, Status
+from simtrack.contracts import NANOSECONDS, Float64, Int32, RgbdFrame, Status
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import is_rigid
+from simtrack.geometry.transforms import difference, is_rigid
 from simtrack.perception.mapping.panoptic.association import AssociationConfig, SegmentLabels
 from simtrack.perception.mapping.panoptic.counts import (
     BACKGROUND,
@@ -20,6 +21,7 @@ from simtrack.perception.mapping.panoptic.counts import (
 )
 from simtrack.perception.mapping.panoptic.entities import EntityConfig, MapEntityMesh, extract_entities
 from simtrack.perception.mapping.panoptic.frame_segments import FrameFusionConfig, FrameSegments, fuse_segments
+from simtrack.perception.mapping.panoptic.regions import SwapConfig, SwappedRegions
 from simtrack.perception.mapping.panoptic.volume import Volume, VolumeConfig
 from simtrack.perception.segmentation.geometric import GeometricConfig, depth_segments
 from simtrack.perception.segmentation.panoptic import PanopticSegments
@@ -44,10 +46,20 @@ class PanopticMapConfig:
     """Metres; farther readings are not used."""
     regularize_every: int = 10
     """Frames."""
+    swap: SwapConfig | None = None
+    """Which parts of the map are written to disk while the camera is far from them; None keeps all in memory."""
+    max_speed: tuple[float, float] = (3.0, 6.0)
+    """m/s and rad/s that a camera in hands or on a robot does not exceed: a faster step is taken for a wrong pose,
+    unless the next frame confirms it."""
+    max_step: tuple[float, float] = (0.1, 0.2)
+    """Metres and radians that are believed however short the time."""
 
     def __post_init__(self) -> None:
         if not 0.1 <= self.max_depth <= 50.0:
             raise InvalidValueError("PanopticMapConfig.max_depth", self.max_depth, "0.1 to 50 metres")
+        for name in ("max_speed", "max_step"):
+            if not min(getattr(self, name)) > 0.0:
+                raise InvalidValueError(f"PanopticMapConfig.{name}", getattr(self, name), "above 0")
         if self.regularize_every < 1:
             raise InvalidValueError("PanopticMapConfig.regularize_every", self.regularize_every, "1 or more")
 
@@ -65,7 +77,7 @@ class PanopticMapConfig:
             raise InvalidValueError("method", method, ", ".join(METHODS))
         config = PanopticMapConfig(volume=VolumeConfig(voxel=voxel), joint=method == "full")
         if method == "voxbloxpp":
-            config = replace(config, fusion=FrameFusionConfig(split=False, cluster=False))
+            config = replace(config, fusion=FrameFusionConfig(split=False, fill=False, cluster=False, flat=False))
         return config
 
 
@@ -86,11 +98,16 @@ class MapUpdate:
 
 
 class PanopticMap:
-    """A TSDF whose voxels carry labels of segments, and what was observed of those."""
+    """A TSDF whose voxels carry labels of segments, and what was observed of those; a context manager if it swaps."""
 
     def __init__(self, config: PanopticMapConfig | None = None) -> None:
         self.config = config or PanopticMapConfig()
         self.volume = Volume(self.config.volume)
+        volume = self.config.volume
+        # The farthest reading in the corner of a wide image, and the truncation behind it.
+        reach = 1.6 * self.config.max_depth + 2.0 * volume.truncation * volume.voxel
+        self.regions = None if self.config.swap is None else SwappedRegions(self.volume, reach, self.config.swap)
+        """Where far parts are, if they are written away."""
         self.labels = SegmentLabels(self.config.association)
         counts = JointCounts if self.config.joint else SeparateCounts
         self.counts: PanopticCounts = counts(self.config.counts)
@@ -98,6 +115,9 @@ class PanopticMap:
         """Frames that were fused."""
         self.skipped: dict[str, int] = {}
         """Reason -> frames that were not."""
+        self._fused: tuple[int, Float64] | None = None
+        self._seen: tuple[int, Float64] | None = None
+        """Stamp and pose of the last frame that was fused, and of the last with a pose."""
 
     def integrate(
         self,
@@ -119,6 +139,10 @@ class PanopticMap:
         reason = _unusable(frame, T_map_camera, panoptic)
         if reason or T_map_camera is None or panoptic is None:
             return self._skip(frame, reason)
+        now, last = (frame.stamp, np.array(T_map_camera, float)), (self._fused, self._seen)
+        self._seen = now
+        if last[0] is not None and not any(self._follows(now, each) for each in last):
+            return self._skip(frame, "the pose jumps")
         depth = np.where(frame.depth <= self.config.max_depth, frame.depth, np.float32(0.0))
         depth = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
         if not depth.any():
@@ -128,6 +152,8 @@ class PanopticMap:
         stuff = self.config.counts.stuff
         segments = fuse_segments(geometric, panoptic, depth, frame.intrinsics, stuff, self.config.fusion)
         stride = max(1, round(frame.intrinsics.width / 320))
+        if self.regions is not None:
+            self.regions.approach(now[1][:3, 3])
         met, counts = self.volume.overlaps(
             depth, segments.image, frame.intrinsics, T_map_camera, self.labels.canonical, stride
         )
@@ -140,6 +166,7 @@ class PanopticMap:
             blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera)
         except InvalidValueError as error:
             return self._skip(frame, str(error))
+        self._fused = now
         self.counts.observe(_observations(segments, labels, panoptic))
         for label, other in self.labels.count_overlaps(met, counts, least):
             self._merge(label, other)
@@ -150,8 +177,28 @@ class PanopticMap:
 
     def entities(self) -> tuple[MapEntityMesh, ...]:
         """The entities of the map, stuff first, then things, by class and number."""
+        self.complete()
         self.counts.regularize()
         return extract_entities(self.volume, self.labels.canonical, self.counts.entities(), self.config.entities)
+
+    def close(self) -> None:
+        """Remove the files of what was written away."""
+        if self.regions is not None:
+            self.regions.close()
+
+    def __enter__(self) -> "PanopticMap":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def complete(self) -> None:
+        """Bring back what was written away, and order the volume: the same map is the same bytes."""
+        if self.regions is not None:
+            self.regions.bring_all()
+        self.volume.order()
 
     def _merge(self, label: int, other: int) -> None:
         canonical = self.labels.canonical
@@ -159,6 +206,16 @@ class PanopticMap:
         if first != second and self.counts.alike(first, second):
             self.labels.merge(second, into=first)
             self.counts.merge(second, into=first)
+
+    def _follows(self, now: tuple[int, Float64], before: tuple[int, Float64] | None) -> bool:
+        """Whether a camera can have come from one pose to the other in that time; either way, streams may go back."""
+        if before is None:
+            return False
+        seconds = abs(now[0] - before[0]) / NANOSECONDS
+        xi = difference(now[1], before[1])
+        moved = np.linalg.norm(xi[:3]), np.linalg.norm(xi[3:])
+        limits = zip(moved, self.config.max_speed, self.config.max_step, strict=True)
+        return all(step <= speed * seconds + slack for step, speed, slack in limits)
 
     def _skip(self, frame: RgbdFrame, reason: str, status: Status = Status.FAILED) -> MapUpdate:
         self.skipped[reason] = self.skipped.get(reason, 0) + 1

@@ -102,16 +102,20 @@ def vertices(around, keys, distances, weights, colors, voxel, least, cells, poin
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def quads(around, distances, labels, cells, corners, owners):
+def quads(around, distances, labels, support, weights, cells, corners, owners, backing, seen):
     """Quads across all edges between voxels that the surface crosses, counter-clockwise seen from before the surface.
 
     Args:
         around: from `neighbours`.
         distances: (C, 512) float32, metres.
         labels: (C, 512) int32.
+        support: (C, 512) int16, observations for the label less those for others.
+        weights: (C, 512) float32, 1/m^2.
         cells: from `vertices`.
         corners: (Q, 4) int32, output.
         owners: (Q,) int32, output: label of the end of the edge that is nearer to the surface.
+        backing: (Q,) int16, output: support of that label there.
+        seen: (Q,) float32, output: weight there.
 
     Returns:
         Number of quads, of which the first Q are written.
@@ -151,10 +155,10 @@ def quads(around, distances, labels, cells, corners, owners):
                         if found < len(corners):
                             for turn in range(4):
                                 corners[found, turn] = quad[turn] if here < 0.0 else quad[3 - turn]
-                            first, second = labels[block, n], labels[b, m]
-                            nearer_first = abs(here) <= abs(there)
-                            chosen = first if nearer_first else second
-                            other = second if nearer_first else first
-                            owners[found] = chosen if chosen > 0 else other
+                            here_first = abs(here) <= abs(there)
+                            here_first = labels[block, n] > 0 if here_first else labels[b, m] <= 0
+                            owners[found] = labels[block, n] if here_first else labels[b, m]
+                            backing[found] = support[block, n] if here_first else support[b, m]
+                            seen[found] = weights[block, n] if here_first else weights[b, m]
                         found += 1
     return found

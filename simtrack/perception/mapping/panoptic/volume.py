@@ -1,18 +1,21 @@
 """A sparse truncated signed distance field with colours and segment labels."""
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
 
-from simtrack.contracts import CameraIntrinsics, Float32, Float64, Int32, Uint8
+from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, Int32, Uint8
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.transforms import inverse
 from simtrack.perception.mapping.panoptic import volume_kernels as kernels
 
 _FIRST = 4096
 """Blocks that there is room for at first."""
+STORED = ("keys", "distances", "weights", "colors", "labels", "support")
+"""Arrays of a volume that have a row for every block."""
 _MOST_WEIGHT, _MOST_SUPPORT = 100.0, 40
 
 
@@ -139,6 +142,48 @@ class Volume:
                 ]:
                     done.result()
         return len(listed)
+
+    def blocks(self, chosen: Bool | None = None) -> dict[str, np.ndarray]:
+        """Arrays (B, ...) of the chosen blocks, of all if None, in the order of their keys."""
+        numbers = np.arange(self.count) if chosen is None else np.flatnonzero(chosen)
+        numbers = numbers[np.argsort(self.keys[numbers], kind="stable")]
+        return {name: getattr(self, name)[numbers] for name in STORED}
+
+    def remove(self, chosen: Bool) -> None:
+        """Take blocks out; (count,) bool."""
+        kept = np.flatnonzero(~chosen)
+        for name in (*STORED, "_seen"):
+            values: np.ndarray = getattr(self, name)
+            values[: len(kept)] = values[kept]
+            values[len(kept) : self.count] = 0
+        self.count = len(kept)
+        self._rehash(len(self.keys))
+
+    def add(self, blocks: Mapping[str, np.ndarray]) -> None:
+        """Put blocks in that are not there.
+
+        Raises:
+            InvalidValueError: there would be more than `VolumeConfig.max_blocks`.
+        """
+        more = len(blocks["keys"])
+        if self.count + more > self.config.max_blocks:
+            allowed = f"at most max_blocks = {self.config.max_blocks}: larger voxels, or more"
+            raise InvalidValueError("blocks of the map", self.count + more, allowed)
+        while self.count + more > len(self.keys):
+            self._grow()
+        for name in STORED:
+            getattr(self, name)[self.count : self.count + more] = blocks[name]
+        self._seen[self.count : self.count + more] = -1
+        self.count += more
+        self._rehash(len(self.keys))
+
+    def order(self) -> None:
+        """Bring the blocks into the order of their keys: what is extracted does not depend on how they came."""
+        whole = self.blocks()
+        for name in STORED:
+            getattr(self, name)[: self.count] = whole[name]
+        self._seen[: self.count] = -1
+        self._rehash(len(self.keys))
 
     def _touched(self, depth: Float32, intrinsics: CameraIntrinsics, T_map_camera: Float64) -> Int32:
         """(B,) blocks within reach of the readings, created where missing."""

@@ -22,6 +22,12 @@ def pack(x, y, z):
     return ((np.int64(x) + _OFFSET) << 42) | ((np.int64(y) + _OFFSET) << 21) | (np.int64(z) + _OFFSET)
 
 
+def block_coordinates(keys):
+    """(N, 3) int64 coordinates of the blocks with these keys (N,)."""
+    mask = np.int64(0x1FFFFF)
+    return np.stack([keys >> 42, (keys >> 21) & mask, keys & mask], axis=1) - _OFFSET
+
+
 @nb.njit(cache=True, nogil=True)
 def find(keys, table, key):
     """Number of the block with a key, -1 if there is none."""
