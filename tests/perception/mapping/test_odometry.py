@@ -44,7 +44,7 @@ def corner():
 def walk(count: int) -> list[Float64]:
     """A smooth way past the corner."""
     steps = np.outer(np.arange(count), [0.012, -0.01, 0.003, 0.002, 0.003, -0.012]).astype(np.float64)
-    return [perturb(START, step) for step in steps]
+    return [perturb(START, np.asarray(step, np.float64)) for step in steps]
 
 
 def test_the_derivative_of_the_alignment_is_that_of_its_sum(corner) -> None:
