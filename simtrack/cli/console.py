@@ -69,19 +69,19 @@ def show_table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: 
     from rich.table import Table
     from rich.text import Text
 
-    rows = list(rows)
+    rows, console = list(rows), out()
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    longest = [max((len(str(row[k])) for row in rows), default=0) for k in range(len(columns))]
+    fits = sum(max(len(name), most) + 2 for name, most in zip(columns, longest, strict=True)) <= console.width
     for k, column in enumerate(columns):
-        longest = max((len(str(row[k])) for row in rows), default=0)
-        if k in right and longest:  # its header may be folded
-            table.add_column(
-                column, justify="right", overflow="fold", min_width=longest, no_wrap=len(column) <= longest
-            )
+        if k in right:
+            width = None if fits or not longest[k] else longest[k]  # its header is folded instead
+            table.add_column(column, justify="right", overflow="fold", width=width, no_wrap=width is None)
         else:
-            table.add_column(column, overflow="fold", min_width=min(longest, _LEAST_TEXT))
+            table.add_column(column, overflow="fold", min_width=min(longest[k], _LEAST_TEXT))
     for row in rows:
         table.add_row(*(cell if isinstance(cell, Text) else Text(str(cell)) for cell in row))
-    out().print(table)
+    console.print(table)
 
 
 class ProgressLine:
