@@ -7,7 +7,7 @@ import tyro
 
 def serve(
     what: Annotated[Literal["segmenter"], tyro.conf.Positional],
-    segmenter: str = "learned",
+    segmenter: str,
     host: str = "127.0.0.1",
     port: int = 8765,
 ) -> int:
@@ -15,8 +15,7 @@ def serve(
 
     Args:
         what: What answers.
-        segmenter: learned (the network that comes along), a folder or .onnx file that `simtrack train segmenter` wrote,
-            or package.module:Class of yours.
+        segmenter: A folder or .onnx file that `simtrack train segmenter` wrote, or package.module:Class of yours.
         host: Address to listen on; the default can be reached from this machine alone.
         port: To listen on; 0 takes a free one.
     """

@@ -11,7 +11,7 @@ import numpy as np
 from simtrack.contracts import Float64, Int32, RgbdFrame
 from simtrack.errors import InvalidValueError
 from simtrack.perception.mapping.odometry.rgbd_odometry import RgbdOdometry
-from simtrack.perception.segmentation.loading import make_segmenter
+from simtrack.perception.segmentation.loading import ALLOWED, make_segmenter
 from simtrack.perception.segmentation.panoptic import PanopticSegments, Segmenter
 from simtrack.simulation.building.rooms.film import FilmConfig, FilmFrame, RoomFilm
 from simtrack.simulation.building.rooms.physics import SettledRoom
@@ -186,7 +186,11 @@ def map_source(
 
 
 def _segmenter(given: str) -> Segmenter:
-    return NoSegmenter() if given == NONE else make_segmenter(given)
+    if given == NONE:
+        return NoSegmenter()
+    if not (":" in given or given.endswith(".onnx") or Path(given).is_dir()):
+        raise InvalidValueError("segmenter", given, f"{ORACLE}, {NONE}, {ALLOWED}")
+    return make_segmenter(given)
 
 
 def _recording(path: Path, film: FilmConfig, segmenter: Segmenter, posed: bool) -> MapSource:

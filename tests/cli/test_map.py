@@ -52,7 +52,7 @@ def test_an_evaluation_of_nonsense_is_refused(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_a_service_that_cannot_listen_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["serve", "segmenter", "--port", "99999"]) == 2
+    assert main(["serve", "segmenter", "--segmenter", "nowhere:Class", "--port", "99999"]) == 2
     assert "65535" in capsys.readouterr().err
     assert main(["serve", "segmenter", "--segmenter", "nowhere:Class"]) == 2
     assert "nowhere" in capsys.readouterr().err

@@ -120,7 +120,8 @@ def test_a_tracker_of_others_that_falters_misses_its_frames(tmp_path: Path, monk
     assert (metrics["foreign.tracker.raised"].value, metrics["foreign.tracker.invalid"].value) == (2, 1)
     with (out / "faults.csv").open() as file:
         rows = [(row["frame"], row["kind"], row["message"]) for row in csv.DictReader(file)]
-    assert rows[:2] == [("2", "raised", "RuntimeError: no memory"), ("3", "raised", "RuntimeError: no memory")]
+    told = "RuntimeError: no memory (falters.py:11, in update)"
+    assert rows[:2] == [("2", "raised", told), ("3", "raised", told)]
     assert "falters:Falters" in (out / "config.yaml").read_text()
 
 
@@ -148,7 +149,7 @@ def test_a_stop_keeps_what_was_measured(tmp_path: Path) -> None:
     process = start("run", "--duration", 600, "--renderer", "embree", "--out", path)
     for _ in range(3000):
         file = path / "trajectory.csv"
-        if file.is_file() and len(file.read_bytes().splitlines()) > 5:
+        if file.is_file() and len(file.read_bytes().splitlines()) > 20:  # errors count from 0.5 s
             break
         assert process.poll() is None, process.communicate()
         time.sleep(0.1)

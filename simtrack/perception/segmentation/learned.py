@@ -18,8 +18,6 @@ from simtrack.perception.segmentation.panoptic_network import (
 )
 
 FILE = "segments.onnx"
-SHIPPED = Path(__file__).resolve().parent / "weights" / FILE
-"""The network that comes along."""
 
 
 class LearnedSegmenter:
@@ -28,15 +26,13 @@ class LearnedSegmenter:
     The classes are those of the training's rooms.
     """
 
-    def __init__(
-        self, path: Path | None = None, config: DecodingConfig | None = None, runtime: Runtime = "auto"
-    ) -> None:
-        """Open a network: the file, or the folder that `simtrack train segmenter` wrote; by default the one shipped.
+    def __init__(self, path: Path, config: DecodingConfig | None = None, runtime: Runtime = "auto") -> None:
+        """Open a network: the file, or the folder that `simtrack train segmenter` wrote.
 
         Raises:
             FileFormatError: there is none, or it is another's.
         """
-        file = SHIPPED if path is None else path / FILE if path.is_dir() else path
+        file = path / FILE if path.is_dir() else path
         self._network = open_network(file, runtime)
         about = self._network.about()
         self._network.expect(("shown",), ("classes", "heat", "offsets"))

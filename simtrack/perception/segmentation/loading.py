@@ -1,4 +1,4 @@
-"""Segmenters by name: the network that comes along, one that was trained, a service, a class of the user's."""
+"""Segmenters by name: a network that was trained, a service, a class of the user's."""
 
 from pathlib import Path
 from typing import cast
@@ -6,8 +6,7 @@ from typing import cast
 from simtrack.errors import StageError
 from simtrack.perception.segmentation.panoptic import Segmenter
 
-LEARNED = "learned"
-ALLOWED = "learned, a folder or .onnx file of `simtrack train segmenter`, http://HOST:PORT, package.module:Class"
+ALLOWED = "a folder or .onnx file of `simtrack train segmenter`, http://HOST:PORT, package.module:Class"
 
 
 def make_segmenter(given: str) -> Segmenter:
@@ -24,10 +23,10 @@ def make_segmenter(given: str) -> Segmenter:
         from simtrack.perception.segmentation.client import HttpSegmenter
 
         return HttpSegmenter(given)
-    if given == LEARNED or given.endswith(".onnx") or Path(given).is_dir():
+    if given.endswith(".onnx") or Path(given).is_dir():
         from simtrack.perception.segmentation.learned import LearnedSegmenter
 
-        return LearnedSegmenter(None if given == LEARNED else Path(given))
+        return LearnedSegmenter(Path(given))
     from simtrack.perception.foreign.loading import build_stage
 
     if ":" not in given:
