@@ -88,7 +88,7 @@ def test_a_foreign_stage_and_what_it_missed_stand_on_top(record: RunRecord, page
         "foreign.tracker.frames": Metric(60, "1"),
         "foreign.tracker.missed_frames": Metric(3, "1", "frames 4-6"),
     }
-    other = render(replace(record, config=record.config | {"tracker": "mine:Tracker"}, metrics=metrics))
+    other = render(replace(record, config={**record.config, "tracker": "mine:Tracker"}, metrics=metrics))
     assert "tracker mine:Tracker" in other
     assert "The tracker missed 3 of 60 frames (frames 4-6)" in other
     assert "The tracker missed" not in page

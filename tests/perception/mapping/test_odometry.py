@@ -62,7 +62,7 @@ def test_the_derivative_of_the_alignment_is_that_of_its_sum(corner) -> None:
     assert known > 0.5 * len(points)
     np.testing.assert_allclose(H, H.T)
     assert np.linalg.eigvalsh(H).min() > 0.0
-    better = perturb(T, -np.linalg.solve(H, g))
+    better = perturb(T, -np.asarray(np.linalg.solve(H, g), dtype=np.float64))
     assert np.linalg.norm(step(better)[1]) < 0.3 * np.linalg.norm(g)
 
 
