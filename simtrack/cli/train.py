@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from simtrack.training.detector import Part, TrainingConfig
+    from simtrack.training.config import TrainingConfig
+    from simtrack.training.detector import Part
     from simtrack.training.loop import Progress
 
 
@@ -45,7 +46,8 @@ def train(
         return _train_agent(out, 30.0 if minutes is None else minutes, seed)
     if data is None:
         raise MissingValueError("--data", "the folder of a data set, which `simtrack generate` makes")
-    from simtrack.training.detector import PARTS, TrainingConfig, prepared
+    from simtrack.training.config import TrainingConfig
+    from simtrack.training.detector import PARTS, prepared
 
     missing = [name for name in ("torch", "onnx") if importlib.util.find_spec(name) is None]
     if missing:
@@ -98,10 +100,11 @@ def _train_agent(out: Path, minutes: float, seed: int) -> int:
 
 def _segmenter(data: Path, out: Path, minutes: float | None, seed: int) -> int:
     from simtrack.cli import console
-    from simtrack.training.segmenter import SegmenterTraining, train_segmenter
+    from simtrack.training.config import TrainingConfig
+    from simtrack.training.segmenter import train_segmenter
 
     try:
-        path = train_segmenter(SegmenterTraining(data, out, minutes, seed), _shown("segments"))
+        path = train_segmenter(TrainingConfig(data, out, minutes, seed), _shown("segments"))
     except KeyboardInterrupt:
         console.show_error("stopped: the same command carries on from the last checkpoint")
         return 130

@@ -1,12 +1,11 @@
 """Training of the keypoint detector: a data set goes in, two ONNX files come out."""
 
-import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from simtrack.errors import DatasetError, InvalidValueError
+from simtrack.errors import DatasetError
+from simtrack.training.config import TrainingConfig, keep_classes
 from simtrack.training.shards import CROPS, IMAGES, Shards, prepare
 from simtrack.training.source import Source, open_source
 
@@ -19,26 +18,7 @@ Part: TypeAlias = Literal["keypoints", "boxes"]
 PARTS: tuple[Part, ...] = ("keypoints", "boxes")
 SAMPLES: dict[Part, int] = {"keypoints": 1_800_000, "boxes": 200_000}
 """Windows and images that the networks see by default."""
-SHARDS, CLASSES = "shards", "classes.json"
-
-
-@dataclass(frozen=True, slots=True)
-class TrainingConfig:
-    """What `train_part` is to do."""
-
-    data: Path
-    """A data set with a BOP part."""
-    out: Path
-    """Checkpoints, logs and networks."""
-    minutes: float | None = None
-    """Of computing time for each network, over all calls; None: until the default number of samples."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise InvalidValueError("seed", self.seed, "0 or more")
-        if self.minutes is not None and not self.minutes > 0.0:
-            raise InvalidValueError("minutes", self.minutes, "> 0")
+SHARDS = "shards"
 
 
 def prepared(config: TrainingConfig, told: Callable[[int, int], None] | None = None) -> Source:
@@ -48,12 +28,7 @@ def prepared(config: TrainingConfig, told: Callable[[int, int], None] | None = N
         DatasetError, FileFormatError: it is none that can be learned from, or `out` is another detector's.
     """
     source = open_source(config.data)
-    config.out.mkdir(parents=True, exist_ok=True)
-    path = config.out / CLASSES
-    names = list(source.class_names)
-    if path.is_file() and (before := json.loads(path.read_text(encoding="utf-8"))) != names:
-        raise DatasetError(config.data, f"its classes are {names}, but {path} says {before}; choose another --out")
-    path.write_text(json.dumps(names) + "\n", encoding="utf-8")
+    keep_classes(config, source.class_names)
     prepare(source, config.out / SHARDS, told)
     return source
 

@@ -17,6 +17,7 @@ from simtrack.datasets.room_films import (
     write_room_films,
 )
 from simtrack.errors import DatasetError, FileFormatError, InvalidValueError
+from simtrack.training.config import TrainingConfig
 from simtrack.training.scores import panoptic_quality
 
 CLASSES = ("chair", "cup", "floor")
@@ -85,7 +86,7 @@ def test_a_network_trains_carries_on_and_its_file_segments(tmp_path: Path, monke
 
     monkeypatch.setattr(segment_task.SegmentTask, "batch_size", 2)
     monkeypatch.setattr(segmenter, "SAMPLES", 4)
-    config = segmenter.SegmenterTraining(write_films(tmp_path / "films"), tmp_path / "out")
+    config = TrainingConfig(write_films(tmp_path / "films"), tmp_path / "out")
     assert segmenter.train_segmenter(config).stat().st_size < 15_000_000
     monkeypatch.setattr(segmenter, "SAMPLES", 8)
     path = segmenter.train_segmenter(config)

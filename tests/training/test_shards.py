@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from simtrack.errors import DatasetError, FileFormatError
-from simtrack.training.detector import TrainingConfig, make_task, prepared
+from simtrack.training.config import TrainingConfig
+from simtrack.training.detector import make_task, prepared
 from simtrack.training.shards import BACKGROUND, CROPS, IMAGE_WIDTH, IMAGES, Shards, prepare
 from simtrack.training.source import images, open_source
 from tests.training.data import WIDTH, write_dataset
