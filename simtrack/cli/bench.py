@@ -24,7 +24,7 @@ def bench(
     """Measure the speed of a part: medians of CPU and wall time, and ratios to peers (extra ``bench``).
 
     Args:
-        name: What is measured.
+        name: What is measured: raycast, tracking, localization, relations, scaling, realtime, datasets or envs.
         json_file: Write the figures, with machine and versions, to this file.
         plots: Draw the benchmark's plots into this folder.
         threads: Threads of the compiled kernels.

@@ -14,7 +14,7 @@ def serve(
     """Segment images that others send over HTTP (docs/mapping.md), until stopped.
 
     Args:
-        what: What answers.
+        what: What answers: segmenter.
         segmenter: A folder or .onnx file that `simtrack train segmenter` wrote, or package.module:Class of yours.
         host: Address to listen on; the default can be reached from this machine alone.
         port: To listen on; 0 takes a free one.

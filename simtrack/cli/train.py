@@ -28,7 +28,7 @@ def train(
     ActivePerception --policy DIR` lets it play (extra rl).
 
     Args:
-        what: What learns.
+        what: What learns: detector, segmenter or agent.
         out: Folder for checkpoints, logs and networks.
         data: For networks: folder of a data set that `simtrack generate` made, of a recipe with the format bop among
             its writers for the detector, rooms_panoptic for the segmenter.

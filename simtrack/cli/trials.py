@@ -20,7 +20,7 @@ def trials(
     """Try the localizer many times in the building of a scene: from a wrong start, or carried off to another place.
 
     Args:
-        kind: What is tried.
+        kind: What is tried: wrong-start or kidnapped.
         scene: Name of a scene, or path of its folder or YAML file.
         count: How often.
         seed: Of the building, its survey and the trials.
