@@ -113,6 +113,7 @@ def measure(
         warmup: turns that do not count (compilation, caches).
         before: called before each turn, not timed.
     """
+    rest()
     cpu: dict[str, list[float]] = {name: [] for name in contestants}
     wall: dict[str, list[float]] = {name: [] for name in contestants}
     for turn in range(warmup + repeats):
@@ -126,6 +127,19 @@ def measure(
                 cpu[name].append(cpu_end - cpu_start)
                 wall[name].append(wall_end - wall_start)
     return {n: Timing(statistics.median(cpu[n]), statistics.median(wall[n]), repeats) for n in contestants}
+
+
+def rest() -> None:
+    """Wait, for a second at most, until all other threads of the process sleep.
+
+    Those of BLAS and TBB wait busily for more work, for a tenth of a second: CPU time that is not what comes next.
+    """
+    deadline = time.perf_counter() + 1.0
+    while time.perf_counter() < deadline:
+        start = time.process_time()
+        time.sleep(0.02)
+        if time.process_time() - start < 0.002:
+            return
 
 
 def machine() -> dict[str, Any]:

@@ -5,7 +5,6 @@ the same outputs: range, normal, face and mesh of every ray; simtrack writes int
 on one thread unless more are asked for, which simtrack and Open3D can use.
 """
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from simtrack.benchmarks import office as scenes
-from simtrack.benchmarks.harness import Benchmark, Options, Timing, measure
+from simtrack.benchmarks.harness import Benchmark, Options, Timing, measure, rest
 from simtrack.benchmarks.office import Office
 from simtrack.benchmarks.yardstick import embreex_scene, scaled
 from simtrack.contracts import Float32, Float64
@@ -185,7 +184,7 @@ def _cast(
     ours = partial(scene.cast, scan.bundle, scan.T_map_sensor, out=out)
     contestants: dict[str, Callable[[], object]] = {"simtrack": ours}
     contestants |= {name: cast for name, make in engines.items() if (cast := make(scan)) is not None}
-    timings = measure(contestants, repeats, before=_rest)
+    timings = measure(contestants, repeats, before=rest)
     for name, timing in timings.items():
         result.add(f"{scan.name}: {name}", timing)
     for name, timing in timings.items():
@@ -196,11 +195,6 @@ def _cast(
     differing = _differing(ours(), contestants["embreex run"]())
     result.add(f"{scan.name}: rays on which simtrack and embreex differ", value=float(differing), unit="rays")
     return timings
-
-
-def _rest() -> None:
-    """Let threads of the one before come to rest: those of BLAS and TBB wait busily for more work, for a while."""
-    time.sleep(0.05)
 
 
 def _differing(hits: RayHits, theirs: Any) -> int:
@@ -285,7 +279,7 @@ def _closest(result: Benchmark, scene: RayScene, world: Office, options: Options
             contestants["Open3D RaycastingScene"] = lambda: peer.compute_closest_points(queries, options.threads)
         except ImportError:
             pass  # noted with the engines
-    timings = measure(contestants, repeats, before=_rest)
+    timings = measure(contestants, repeats, before=rest)
     for name, timing in timings.items():
         result.add(f"closest points of {count} points: {name}", timing)
     for name, timing in timings.items():
