@@ -184,7 +184,7 @@ def _cast(
     ours = partial(scene.cast, scan.bundle, scan.T_map_sensor, out=out)
     contestants: dict[str, Callable[[], object]] = {"simtrack": ours}
     contestants |= {name: cast for name, make in engines.items() if (cast := make(scan)) is not None}
-    timings = measure(contestants, repeats, before=rest)
+    timings = measure(contestants, repeats, before=rest, primed=True)
     for name, timing in timings.items():
         result.add(f"{scan.name}: {name}", timing)
     for name, timing in timings.items():
@@ -279,7 +279,7 @@ def _closest(result: Benchmark, scene: RayScene, world: Office, options: Options
             contestants["Open3D RaycastingScene"] = lambda: peer.compute_closest_points(queries, options.threads)
         except ImportError:
             pass  # noted with the engines
-    timings = measure(contestants, repeats, before=rest)
+    timings = measure(contestants, repeats, before=rest, primed=True)
     for name, timing in timings.items():
         result.add(f"closest points of {count} points: {name}", timing)
     for name, timing in timings.items():

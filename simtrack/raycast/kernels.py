@@ -17,7 +17,7 @@ import numba as nb
 import numpy as np
 
 from simtrack.raycast import packets
-from simtrack.raycast.vector import any_within, carray, pointer, rotate
+from simtrack.raycast.vector import allow, any_within, carray, gather, gather_vectors, pointer, rotate
 
 GROUP = 8
 """Packets of a bundle that share a cone."""
@@ -312,22 +312,25 @@ def cast_bundle_parallel(
 # --------------------------------------------------------------------------------------------- rays of their own origin
 
 
+@nb.njit(cache=True, nogil=True, inline="always")
+def _load(lanes, packet, valid, order, origins, directions, times):
+    """Fill one packet with rays of their own origin and time; a ray that is not finite or has no direction is off.
+
+    All but `lanes` are addresses, `order` that of the packet's rays; `times` is 0 if there are none.
+    """
+    row = 4 * len(lanes)
+    gather_vectors(lanes, origins, order, packet)
+    gather_vectors(lanes, directions, order, packet + 4 * row)
+    if times:
+        gather(lanes, times, order, packet + 7 * row)
+    allow(lanes, packet, valid)
+
+
 @nb.njit(cache=True, nogil=True)
-def _load(lanes, packet, integers, valid, rays, base):
-    """Fill one packet with rays of their own origin and time; a ray that is not finite or has no direction is off."""
-    for k in range(len(lanes)):
-        ray = rays.order[base + k]
-        poison = np.float32(0.0)
-        length = np.float32(0.0)
-        for axis in range(3):
-            packet[axis * len(lanes) + k] = rays.origins[ray, axis]
-            packet[(4 + axis) * len(lanes) + k] = rays.directions[ray, axis]
-            poison += np.float32(0.0) * (rays.origins[ray, axis] + rays.directions[ray, axis])
-            length += abs(rays.directions[ray, axis])
-        if rays.times.shape[0] > 0:
-            packet[7 * len(lanes) + k] = rays.times[ray]
-            poison += np.float32(0.0) * rays.times[ray]
-        valid[k] = -1 if poison == 0.0 and length > 0.0 else 0
+def _addresses_of_rays(rays):
+    """Addresses of origins, directions and, if there are any, times, which the caller holds."""
+    times = packets.address(rays.times) if rays.times.shape[0] > 0 else np.intp(0)
+    return packets.address(rays.origins), packets.address(rays.directions), times
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -344,11 +347,12 @@ def _rays_chunk(chunk, lanes, world, ray_fields, near, far, coherent, out):
     p_rows, p_motion, p_order = packets.address(rows), packets.address(motion), packets.address(rays.order)
     pose = T_ground_map[:3].astype(np.float32)
     p_pose = packets.address(pose)
+    p_origins, p_directions, p_times = _addresses_of_rays(rays)
     p_distances, p_normals, p_faces, p_instances = out
     for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, rays.order.shape[0] // width)):
         base = block * width
         packets.reset(lanes, p_packet, far)
-        _load(lanes, packet, integers, valid, rays, base)
+        _load(lanes, p_packet, p_valid, p_order + 4 * base, p_origins, p_directions, p_times)
         if others:
             packets.intersect(lanes, p_valid, others, p_packet, p_arguments)
         if ground:
@@ -391,10 +395,11 @@ def _occluded_chunk(chunk, lanes, others, ground, T_ground_map, ray_fields, near
     arguments = packets.arguments()
     p_valid, p_packet, p_arguments = packets.address(valid), packets.address(packet), packets.address(arguments) + 64
     pose = T_ground_map[:3].astype(np.float32)
-    p_pose = packets.address(pose)
+    p_pose, p_order = packets.address(pose), packets.address(rays.order)
+    p_origins, p_directions, p_times = _addresses_of_rays(rays)
     for block in range(chunk * CHUNK, min((chunk + 1) * CHUNK, rays.order.shape[0] // len(lanes))):
         base = block * len(lanes)
-        _load(lanes, packet, integers, valid, rays, base)
+        _load(lanes, p_packet, p_valid, p_order + 4 * base, p_origins, p_directions, p_times)
         for k in range(len(lanes)):
             limit = limits[rays.order[base + k]]
             packet[8 * len(lanes) + k] = limit

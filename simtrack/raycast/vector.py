@@ -186,6 +186,64 @@ def _scatter(rows: int) -> Any:
     return scatter
 
 
+def _gather(rows: int) -> Any:
+    """Intrinsic ``gather(lanes, source, order, target)``: the rays' places in an array to `rows` rows of the packet.
+
+    The reverse of `_scatter`: four lanes whose rays are neighbours are read at once.
+    """
+
+    def gather(typing_context: Any, lanes: Any, source: Any, order: Any, target: Any) -> Any:
+        def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
+            array, index = (builder.inttoptr(argument, _INT.as_pointer()) for argument in arguments[1:3])
+            four, many = ir.VectorType(_INT, 4), ir.VectorType(_INT, 4 * rows)
+            for lane in range(0, lanes.count, 4):
+                rays = builder.load(builder.bitcast(_word(builder, index, lane), four.as_pointer()), align=4)
+                first = builder.extract_element(rays, ir.Constant(_INT, 0))
+                row = builder.add(_splat(builder, first, 4), ir.Constant(four, [0, 1, 2, 3]))
+                apart = builder.bitcast(builder.icmp_signed("!=", rays, row), ir.IntType(4))
+                to = [_offset(builder, arguments[3], lane + k * lanes.count) for k in range(rows)]
+                with builder.if_else(builder.icmp_unsigned("==", apart, ir.Constant(ir.IntType(4), 0))) as (near, far):
+                    with near:
+                        place = builder.bitcast(builder.gep(array, [_times(builder, first, rows)]), many.as_pointer())
+                        mixed, none = builder.load(place, align=4), ir.Constant(many, ir.Undefined)
+                        for k, address in enumerate(to):
+                            lanes_of = ir.Constant(four, [rows * j + k for j in range(4)])
+                            value = builder.shuffle_vector(mixed, none, lanes_of)
+                            builder.store(value, _vector_at(builder, address, _INT, 4), align=4)
+                    with far:
+                        for j in range(4):
+                            ray = builder.extract_element(rays, ir.Constant(_INT, j))
+                            place = builder.gep(array, [_times(builder, ray, rows)])
+                            for k, address in enumerate(to):
+                                into = builder.inttoptr(_offset(builder, address, j), _INT.as_pointer())
+                                builder.store(builder.load(_word(builder, place, k), align=4), into, align=4)
+            return context.get_dummy_value()
+
+        return types.void(lanes, types.intp, types.intp, types.intp), generate
+
+    return gather
+
+
+def _allow(typing_context: Any, lanes: Any, packet: Any, valid: Any) -> Any:
+    """Intrinsic ``allow(lanes, packet, valid)``: -1 in lanes whose ray is finite and has a direction, 0 in others."""
+
+    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
+        width = lanes.count
+        zeros = ir.Constant(ir.VectorType(_FLOAT, width), [0.0] * width)
+        poison, moves = zeros, ir.Constant(ir.VectorType(ir.IntType(1), width), None)
+        for row in (0, 1, 2, 4, 5, 6, 7):  # origin, direction, time
+            value = builder.load(_vector_at(builder, _offset(builder, arguments[1], row * width), _FLOAT, width), align=4)
+            poison = builder.fadd(poison, builder.fmul(zeros, value))
+            if 4 <= row <= 6:
+                moves = builder.or_(moves, builder.fcmp_unordered("!=", value, zeros))
+        fine = builder.and_(moves, builder.fcmp_ordered("==", poison, zeros))
+        out = builder.sext(fine, ir.VectorType(_INT, width))
+        builder.store(out, _vector_at(builder, arguments[2], _INT, width), align=4)
+        return context.get_dummy_value()
+
+    return types.void(lanes, types.intp, types.intp), generate
+
+
 def _word(builder: ir.IRBuilder, pointer_: Any, number: int) -> Any:
     return builder.gep(pointer_, [ir.Constant(_INT, number)])
 
@@ -236,6 +294,12 @@ scatter: Any = intrinsic(_scatter(1))
 """``scatter(lanes, source, order, target)``: lane k of a row goes to word ``order[k]`` after `target`."""
 scatter_vectors: Any = intrinsic(_scatter(3))
 """``scatter_vectors(lanes, source, order, target)``: rows x, y, z; lane k goes to ``3 * order[k]`` and the next two."""
+gather: Any = intrinsic(_gather(1))
+"""``gather(lanes, source, order, target)``: word ``order[k]`` after `source` to lane k of a row."""
+gather_vectors: Any = intrinsic(_gather(3))
+"""``gather_vectors(lanes, source, order, target)``: words ``3 * order[k]`` and the next two to lane k of rows x, y, z."""
+allow: Any = intrinsic(_allow)
+"""``allow(lanes, packet, valid)``: -1 in lanes whose ray is finite and has a direction, 0 in the others."""
 uniformity: Any = intrinsic(_uniformity)
 """``uniformity(lanes, first, second)``: 3 if `first` is the same in all lanes and `second` nowhere negative, 1 if that
 is negative in all lanes, else 0."""

@@ -7,11 +7,16 @@ centimetres. Sums run over fixed chunks on the calling thread, so results do not
 import numpy as np
 from numba import njit
 
+from simtrack.raycast.packets import address
+from simtrack.raycast.vector import prefetch
+
 ROWS = 9
 """Of the array of correspondences: 0-2 the measured point from the base's origin, in the axes of the map, at the pose
 of the cast; 3-5 the plane's normal; 6 the signed distance of the point from the plane at the pose of the cast, metres;
 7 the information of that distance; 8 that of the plane's own position, which the map's error leaves."""
 
+_AHEAD = 24
+"""Rays ahead of which planes are fetched: they lie all over the memory."""
 _CHUNK = 1024
 _SAMPLES = 1024
 _BINS = 512
@@ -58,8 +63,10 @@ def pair(T, view, hits, planes, map_instance, gate, pointing_sigma, patch_varian
     limit, slack = np.float32(gate), np.float32(6.0 * gate + 0.1)
     across2, shared2, one = np.float32(pointing_sigma**2), np.float32(patch_variance), np.float32(1.0)
     kept = np.uint32(0)  # unsigned indices need no check for being negative
+    p_planes, last = address(planes), ranges.shape[0] - 1
     for ray in range(ranges.shape[0]):
         i = np.uint32(ray)
+        prefetch(p_planes + 16 * np.intp(faces[np.uint32(min(ray + _AHEAD, last))]))
         slip = ranges[i] - distances[i]
         if instances[i] != map_instance or not abs(slip) <= slack:
             continue

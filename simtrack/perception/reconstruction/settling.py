@@ -58,7 +58,7 @@ class SettlingConfig:
     """Share of the friction that is counted on."""
     rounds: int = 4
     """Of holding what went too far and settling the others again; 0: nothing settles."""
-    tilt: float = float(np.radians(2.0))
+    tilt: float = float(np.radians(4.0))
     """Radians by which the scene at rest is tilted to each side; 0: it is not."""
     wobble: float = 0.02
     """Metres of motion of any of its points from which a body that is tilted so is wobbly."""
