@@ -16,6 +16,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 
+PRIMING = 0.02
+"""See `measure`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Options:
     """What a user asks of a benchmark."""
@@ -113,8 +117,8 @@ def measure(
         repeats: turns of each; the medians are returned.
         warmup: turns that do not count (compilation, caches).
         before: called before each turn, not timed.
-        primed: before each timed go another one that is not, so that nobody pays for the caches that the one before
-            left behind. For what may be done again at once.
+        primed: before each timed go others that are not, for `PRIMING` seconds: nobody pays for the caches that the
+            one before left behind, nor for a processor that wakes up. For what may be done again at once.
     """
     rest()
     cpu: dict[str, list[float]] = {name: [] for name in contestants}
@@ -123,7 +127,8 @@ def measure(
         for name, work in contestants.items():
             if before is not None:
                 before()
-            if primed:
+            awake = time.perf_counter() + PRIMING
+            while primed and time.perf_counter() < awake:
                 work()
             cpu_start, wall_start = time.process_time(), time.perf_counter()
             work()
