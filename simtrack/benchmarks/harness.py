@@ -15,7 +15,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-
 PRIMING = 0.02
 """See `measure`."""
 

@@ -230,7 +230,7 @@ def _corrections(
         "cast": lambda: site.surface.cast(start, shots, reach=np.inf),
         "half": lambda: _corrected(site, shots, start, (2,)),
     }
-    timings = measure(contestants, repeats)
+    timings = measure(contestants, repeats, primed=True)
     steps = _corrected(site, shots, start, (1,)).steps
     name = f"correction, {len(shots):,} rays, {steps} steps"
     result.add(name, timings["all"], asked=asked, note="one cast, all rays")
@@ -251,7 +251,7 @@ def _peers(
             aligners |= prepare(site.surface.static_map, shots.points, threads)
         except ImportError:
             result.notes.append(f"{name} is not installed (extra bench): no comparison with it.")
-    timings = measure({name: partial(align, starts[0]) for name, align in aligners.items()}, repeats)
+    timings = measure({name: partial(align, starts[0]) for name, align in aligners.items()}, repeats, primed=True)
     for name, align in aligners.items():
         final = [site.errors(align(T)) for T in starts]
         millimetres, degrees = np.median(final, axis=0)

@@ -391,7 +391,7 @@ def cast_rays_parallel(
 @nb.njit(cache=True, nogil=True)
 def _occluded_chunk(chunk, lanes, others, ground, T_ground_map, ray_fields, near, limits, blocked):
     rays = Rays(*ray_fields)
-    packet, integers, valid = packets.new_packet(lanes, near, np.float32(0.0))
+    packet, _, valid = packets.new_packet(lanes, near, np.float32(0.0))
     arguments = packets.arguments()
     p_valid, p_packet, p_arguments = packets.address(valid), packets.address(packet), packets.address(arguments) + 64
     pose = T_ground_map[:3].astype(np.float32)

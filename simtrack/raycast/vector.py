@@ -232,7 +232,8 @@ def _allow(typing_context: Any, lanes: Any, packet: Any, valid: Any) -> Any:
         zeros = ir.Constant(ir.VectorType(_FLOAT, width), [0.0] * width)
         poison, moves = zeros, ir.Constant(ir.VectorType(ir.IntType(1), width), None)
         for row in (0, 1, 2, 4, 5, 6, 7):  # origin, direction, time
-            value = builder.load(_vector_at(builder, _offset(builder, arguments[1], row * width), _FLOAT, width), align=4)
+            at = _vector_at(builder, _offset(builder, arguments[1], row * width), _FLOAT, width)
+            value = builder.load(at, align=4)
             poison = builder.fadd(poison, builder.fmul(zeros, value))
             if 4 <= row <= 6:
                 moves = builder.or_(moves, builder.fcmp_unordered("!=", value, zeros))
@@ -297,7 +298,7 @@ scatter_vectors: Any = intrinsic(_scatter(3))
 gather: Any = intrinsic(_gather(1))
 """``gather(lanes, source, order, target)``: word ``order[k]`` after `source` to lane k of a row."""
 gather_vectors: Any = intrinsic(_gather(3))
-"""``gather_vectors(lanes, source, order, target)``: words ``3 * order[k]`` and the next two to lane k of rows x, y, z."""
+"""``gather_vectors(lanes, source, order, target)``: words ``3 * order[k]`` and following to lane k of rows x, y, z."""
 allow: Any = intrinsic(_allow)
 """``allow(lanes, packet, valid)``: -1 in lanes whose ray is finite and has a direction, 0 in the others."""
 uniformity: Any = intrinsic(_uniformity)
