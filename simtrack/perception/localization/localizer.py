@@ -179,7 +179,7 @@ class MeshLocalizer:
 
     def pose_at(self, stamp: int) -> Localization:
         """Best pose at `stamp`: between corrections the drift is spread evenly, beyond the last odometry leads on."""
-        T, P = self._poses.at(stamp)
+        T, P = self._poses.at(stamp, cautious=False)
         last = self._poses.latest
         return Localization(stamp, T, P, last.status, last.inlier_share, last.residual)
 
@@ -195,7 +195,7 @@ class MeshLocalizer:
         if not self._trusted:
             return self._look_around(measurement)
         T, P = self._draft.at(measurement.stamp)
-        skew = 0.25 * self._draft.odometry.noise(scan_start, measurement.stamp)
+        skew = 0.25 * self._draft.drift(scan_start, measurement.stamp)
         turned = rotate_covariance(T[:3, :3], skew)
         found = register(measurement, self.surface, T, P, self.config.registration, systematic=turned, assessed=True)
         judged = found.assessment or UNJUDGED
