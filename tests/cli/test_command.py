@@ -78,7 +78,7 @@ def test_scenes_are_listed() -> None:
 
 def test_unknown_names_list_the_known(tmp_path: Path) -> None:
     nowhere = simtrack_process("run", "nowhere", "--out", tmp_path / "x")
-    assert "Known: kitchen, lab_floor, open_kitchen, rooms" in refusal(nowhere)
+    assert "Known: hidden_chair, kitchen, lab_floor, open_kitchen, rooms, split_table" in refusal(nowhere)
     assert "explorer" in refused("run", "--agent", "nobody", "--out", tmp_path / "x")
     assert "oracle" in refused("run", "--detector", "psychic", "--out", tmp_path / "x")
     assert "multimeter" in refused("objects", "unobtainium")

@@ -28,6 +28,8 @@ SERVICE = (1.3, 1.7)
 """Metres, depth and width, of clear floor before what a robot is to work at."""
 AMID = 0.2
 """Metres off the middle of what it stands on, at most, of what a robot is to work at."""
+NEAR = 0.03
+"""Metres between what is paired."""
 OPENS = 0.45
 """Chance of a joint to be open."""
 
@@ -151,6 +153,26 @@ class Furnisher:
                     self._at_front_edge(on_top, max(self.faces[known:], key=lambda face: float(face.T_map_face[2, 3])))
                 return
             self.space.free, self.space.ways = before
+
+    def paired(self, family: str, before: str) -> None:
+        """Put a thing to a wall, and another one close before its middle, turned to it."""
+        (name, model), (name_before, model_before) = self.make(family), self.make(before)
+        depth, depth_before = float(model.extents[1]), float(model_before.extents[1])
+        for _ in range(60):
+            taken = self.space.free.copy(), self.space.ways
+            found = self.space.put_at_wall(_Footprint(model.extents[[1, 0, 2]]), self.rng, attempts=60)
+            if found is None:
+                return
+            x, y, heading = found
+            away = depth / 2 + NEAR + depth_before / 2
+            x_before, y_before = x + away * float(np.cos(heading)), y + away * float(np.sin(heading))
+            footprint = _Footprint(model_before.extents[[1, 0, 2]])
+            if self.space.put(footprint, x_before, y_before, heading + np.pi, gap=0.0):
+                self.add(name, model, _standing(model, x, y, heading + np.pi / 2, 0.0), {})
+                turned = heading + np.pi + np.pi / 2
+                self.add(name_before, model_before, _standing(model_before, x_before, y_before, turned, 0.0), {})
+                return
+            self.space.free, self.space.ways = taken
 
     def _at_front_edge(self, family: str, face: _Face) -> None:
         """Stand a closed thing at the front edge of a face, turned to it."""

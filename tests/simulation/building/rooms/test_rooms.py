@@ -9,8 +9,9 @@ from simtrack.geometry.transforms import apply, inverse
 from simtrack.objects.cad import cad_classes, cad_models
 from simtrack.simulation.building.rooms.evaluation import evaluation_rooms
 from simtrack.simulation.building.rooms.families import FAMILIES
+from simtrack.simulation.building.rooms.furnisher import NEAR
 from simtrack.simulation.building.rooms.physics import FLOOR, WALLS, SettledRoom, compiled, settled_room
-from simtrack.simulation.building.rooms.plan import plan_room
+from simtrack.simulation.building.rooms.plan import PAIRED, RoomKind, plan_room
 from simtrack.simulation.building.rooms.walk import WalkConfig, partial_entities
 
 
@@ -144,3 +145,18 @@ def test_in_an_open_kitchen_fridge_and_microwave_are_closed_with_clear_floor_bef
                     (np.abs(ahead[:, 0]) < half[0]) & (ahead[:, 1] < -half[1] - 0.05) & (ahead[:, 1] > -half[1] - 1.2)
                 )
                 assert not (near & standing).any(), name
+
+
+@pytest.mark.parametrize("kind", PAIRED)
+@pytest.mark.parametrize("seed", [0, 8])
+def test_one_of_a_pair_stands_close_before_the_middle_of_the_other_at_a_wall(kind: RoomKind, seed: int) -> None:
+    plan = plan_room(seed, kind)
+    things = {thing.name: thing for thing in plan.placed}
+    rear, front = (things[f"{name}1"] for name in PAIRED[kind])
+    low, high = plan.room.polygon.min(axis=0), plan.room.polygon.max(axis=0)
+    back = apply(rear.T_map_model, np.array([[0.0, rear.model.extents[1] / 2, 0.0]]))[0, :2]
+    assert np.minimum(back - low, high - back).min() < 0.1
+    T_rear_front = inverse(rear.T_map_model) @ front.T_map_model
+    gap = -T_rear_front[1, 3] - (rear.model.extents[1] + front.model.extents[1]) / 2
+    assert gap == pytest.approx(NEAR) and T_rear_front[0, 3] == pytest.approx(0.0, abs=1e-9)
+    assert T_rear_front[1, 1] == pytest.approx(-1.0), "turned to each other"
