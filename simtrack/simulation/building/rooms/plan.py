@@ -18,7 +18,7 @@ KINDS: tuple[RoomKind, ...] = ("bedroom", "living", "study", "kitchen")
 ALL_KINDS: tuple[RoomKind, ...] = (*KINDS, "open-kitchen", "split-table", "hidden-chair")
 """Those that can be asked for; in an ``open-kitchen`` the floor before fridge and microwave is kept clear,
 and nothing lies or leans about on it that no survey would show. The last two are what mapping fails at (reconstruction
-paper, section 5.5): a table that the chair before it cuts in two for the camera, and a chair of which it sees little."""
+paper, section 5.5): a table that the chair before it cuts in two for a camera, and a chair of which it sees little."""
 PAIRED: dict[RoomKind, tuple[str, str]] = {"split-table": ("table", "chair"), "hidden-chair": ("chair", "table")}
 """What stands against a wall, and what stands close before it, turned to it."""
 SERVED: dict[RoomKind, tuple[tuple[str, str | None], ...]] = {
