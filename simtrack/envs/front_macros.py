@@ -29,6 +29,8 @@ LIFT, STROKE = 0.03, 0.22
 """Metres that a thing is lifted off a shelf, and that the arm pulls it out or pushes it in."""
 RELEASE = 0.005
 """Metres above its place at which it is let go."""
+SWEEP = 0.35
+"""Metres before the place to insert something at which the arm stretches out."""
 BACK = 0.12
 """Metres that the base backs off from a door that it has let go."""
 DRIVE_GAIN, DRIVE_LIMIT = 1.5, 0.25
@@ -112,22 +114,27 @@ def take(m: Manipulator, model: ObjectModel, T_map_object: Float64) -> Motion:
 
 
 def insert(m: Manipulator, place: Float64) -> Motion:
-    """Put what is held to a place (3,) of its origin, map frame: straight in, down, and back without it."""
-    assert m.held is not None
-    reach, torso = FrontReach(m.arm), m.torso()
-    ahead = np.array([1.0, 0.0, 0.0])
-    T_cup_object = m.held.T_cup_object
-    best = None
-    for angle in AIMS.tolist():
-        direction = turned(ahead, angle)
-        wanted = apply(inverse(m.T_map_base), place[None])[0] - _level(direction) @ T_cup_object[:3, 3]
-        inside = reach.joints(wanted + (0.0, 0.0, LIFT), direction, torso, level=True)
-        outside = reach.joints(wanted - STROKE * direction + (0.0, 0.0, LIFT), direction, torso, level=True)
-        if inside is not None and outside is not None:
-            best = wanted, direction, outside
+    """Put what is held to a place (3,) of its origin, map frame: straight in, down, and back without it.
+
+    The arm stretches out some way before it, and the base carries it there: on its way a hand sweeps through a part of
+    what it is to reach into, and would push that away.
+    """
+    start = m.T_map_base.copy()
+    begun = _insertion(m, place)
+    if begun is None:
+        return m.refuse(Outcome.OUT_OF_REACH)
+    yield from _back_off(m, SWEEP)
+    yield from m.go(begun[2])
+    for _ in range(60):
+        if float((start[:2, 3] - m.T_map_base[:2, 3]) @ m.T_map_base[:2, 0]) < 0.01:
             break
+        _drive(m, start)
+        yield
+    yield from m.wait(3)
+    best = _insertion(m, place)
     if best is None:
         return m.refuse(Outcome.OUT_OF_REACH)
+    reach = FrontReach(m.arm)
     wanted, direction, outside = best
     high = wanted + (0.0, 0.0, LIFT)
     yield from m.go(outside)
@@ -140,6 +147,22 @@ def insert(m: Manipulator, place: Float64) -> Motion:
     low = wanted + (0.0, 0.0, RELEASE)
     yield from _stroke(m, reach, low, low - STROKE * direction, direction)
     m.outcome = Outcome.DONE
+
+
+def _insertion(m: Manipulator, place: Float64) -> tuple[Float64, Float64, dict[str, float]] | None:
+    """Where the cup has to be, base frame, in which direction, and the joint angles `STROKE` before that."""
+    assert m.held is not None
+    reach, torso = FrontReach(m.arm), m.torso()
+    ahead = np.array([1.0, 0.0, 0.0])
+    T_cup_object = m.held.T_cup_object
+    for angle in AIMS.tolist():
+        direction = turned(ahead, angle)
+        wanted = apply(inverse(m.T_map_base), place[None])[0] - _level(direction) @ T_cup_object[:3, 3]
+        inside = reach.joints(wanted + (0.0, 0.0, LIFT), direction, torso, level=True)
+        outside = reach.joints(wanted - STROKE * direction + (0.0, 0.0, LIFT), direction, torso, level=True)
+        if inside is not None and outside is not None:
+            return wanted, direction, outside
+    return None
 
 
 # ------------------------------------------------------------------------------------------------------------- motions

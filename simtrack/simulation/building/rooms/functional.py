@@ -1,7 +1,7 @@
 """A room of a seed as it truly is, as an MJCF scene in which doors open and things can be carried."""
 
 from pathlib import Path
-from shutil import rmtree
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -31,12 +31,15 @@ def functional_room(seed: int, kind: RoomKind | None = None) -> Path:
     folder = paths.cache_dir() / "functional-rooms" / f"{kind or 'any'}-{seed}-{digest(*own)}"
     file = folder / "scene.xml"
     if not file.is_file():
-        work = folder.with_name(f"{folder.name}.part")
-        rmtree(work, ignore_errors=True)
-        work.parent.mkdir(parents=True, exist_ok=True)
-        write_scene(room_tree(settled_room(seed, kind)), work)
-        rmtree(folder, ignore_errors=True)
-        work.rename(folder)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=f"{folder.name}-", dir=folder.parent, ignore_cleanup_errors=True) as work:
+            made = Path(work) / "room"
+            write_scene(room_tree(settled_room(seed, kind)), made)
+            try:
+                made.rename(folder)
+            except OSError:  # another process was first
+                if not file.is_file():
+                    raise
     return file
 
 
