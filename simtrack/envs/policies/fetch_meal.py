@@ -95,9 +95,9 @@ class FetchMealPolicy(Driver):
         With `more`, any angle from the last of them on will do, and `ENOUGH` if no more can be done.
         """
         a, angle = front.articulation, float(angles[-1])
-        least = min(a.lower + angle, a.upper)
+        least, moved = min(a.lower + angle, a.upper), False
         for attempt in range(TRIES + 1):
-            yield from self._see(front)
+            yield from self._see(front, move=not moved)  # going round an open door would push it
             q = self._joint(a).position
             near = SHUT if angle == 0.0 else NEARLY
             if abs(q - least) < near or (more and q > least):
@@ -116,6 +116,7 @@ class FetchMealPolicy(Driver):
                 wanted = next(can, wanted)  # from where it has really come to stand
                 push = wanted if angle > 0.0 else a.lower - 0.03
                 yield from self._ask(Request("articulate", self._in_base(front.at(spot, q)[0]), push))
+                moved = self._outcome is Outcome.DONE
                 yield from self._straight(-0.1)
             self._failed.append(stance[:2, 3])  # if it is tried again, then from elsewhere
         self._failed.clear()
