@@ -36,6 +36,7 @@ class Driver:
     def begin(self, rng: np.random.Generator) -> None:
         """See `simtrack.envs.policies.Policy`."""
         self._floor = FloorPlan(self._briefing.static_map)
+        self._met: list[Float64] = []
         self._gaze: Float64 | None = None
         self._lift = 0.3
 
@@ -93,6 +94,7 @@ class Driver:
 
     def _way(self, goal: Float64) -> list[Float64]:
         """Places (2,) of the map that lead to a goal."""
+        self._mind_obstacles()
         path = self._floor.plan(self._belief.localization.T_map_base[:2, 3], goal)
         return [goal] if path is None else [*path[3:], goal]
 
@@ -100,8 +102,18 @@ class Driver:
         """Something is in the way that the survey does not show: remember it, and back off."""
         T = self._belief.localization.T_map_base
         ahead = [turned(T[:3, 0], angle) for angle in np.deg2rad([-25.0, 0.0, 25.0]).tolist()]
-        self._floor.block(np.array([T[:2, 3] + BUMPER * direction[:2] for direction in ahead]))
+        self._met += [T[:2, 3] + BUMPER * direction[:2] for direction in ahead]
         yield from self._straight(-0.2)
+
+    def _obstacles(self) -> list[Float64]:
+        """Places (2,) of the map that are taken now, though the survey does not show it: what was run into."""
+        return self._met
+
+    def _mind_obstacles(self) -> None:
+        """Bring the floor plan up to date with what is in the way now."""
+        self._floor.unblock()
+        if places := self._obstacles():
+            self._floor.block(np.array(places))
 
     def _stalled(self, been: list[Float64]) -> bool:
         """Remember where the base is; whether it does not get on, because the arm leans against something."""

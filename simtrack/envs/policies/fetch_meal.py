@@ -25,6 +25,8 @@ NEARLY = np.deg2rad(9.0)
 """Radians off the wanted position that do not matter."""
 SHUT = np.deg2rad(3.0)
 """Radians up to which a door is believed to be shut."""
+AJAR = np.deg2rad(15.0)
+"""Radians from which on the fridge's leaf is in the way of who drives past."""
 FRESH = 1.0
 """Seconds since something was seen, up to which it counts as known."""
 VIEW = 1.25
@@ -121,14 +123,17 @@ class FetchMealPolicy(Driver):
             self._failed.append(stance[:2, 3])  # if it is tried again, then from elsewhere
         self._failed.clear()
         yield from self._wait(10)
-        return more and self._joint(a).position > a.lower + ENOUGH
+        return more and self._opened(front) > ENOUGH
 
     def _take(self) -> Tried:
         item = self._goal.subject
         middle = self._shelf()
+        self._failed.clear()
         for _ in range(TRIES):
             yield from self._view(middle, self._fridge.outwards_closed)
             track = yield from self._look_for(item, middle)
+            if self._opened(self._fridge) < ENOUGH:
+                return False  # it has been run into
             if track is None:
                 middle = middle + (0.0, 0.0, -0.25) if middle[2] > 0.8 else middle + (0.0, 0.0, 0.3)
                 continue
@@ -140,6 +145,7 @@ class FetchMealPolicy(Driver):
             if stance is None:
                 return False
             yield from self._come(*stance)
+            self._failed.append(stance[0][:2, 3])  # if it is tried again, then from elsewhere
             yield from self._look_for(item, place)
             track = believed(self._belief, item)
             if track is not None:
@@ -147,8 +153,6 @@ class FetchMealPolicy(Driver):
             yield from self._straight(-0.4)
             if self._holds:
                 return True
-            if self._joint(self._fridge.articulation).position < self._fridge.articulation.lower + ENOUGH:
-                return False
         return False
 
     def _insert(self) -> Plan:
@@ -179,6 +183,20 @@ class FetchMealPolicy(Driver):
     def _joint(self, articulation: Articulation) -> JointEstimate:
         return next(joint for joint in self._belief.joints if joint.name == articulation.name)
 
+    def _opened(self, front: Front) -> float:
+        """How far a door is believed to be open, radians."""
+        return self._joint(front.articulation).position - front.articulation.lower
+
+    def _obstacles(self) -> list[Float64]:
+        """See `Driver`; and the leaf of the fridge's door, where it stands open."""
+        a, opened = self._fridge.articulation, self._opened(self._fridge)
+        if opened < AJAR:
+            return self._met
+        leaf = apply(motion(a, a.lower + opened), a.vertices.astype(float))[:, :2]
+        tip = leaf[int(np.argmax(np.linalg.norm(leaf - a.anchor[:2], axis=1)))]
+        along = np.linspace(a.anchor[:2], tip, 1 + int(np.linalg.norm(tip - a.anchor[:2]) / self._floor.config.cell))
+        return [*self._met, *along]
+
     def _fresh(self, seen: int | None) -> bool:
         return seen is not None and self._belief.stamp - seen < FRESH * NANOSECONDS
 
@@ -196,7 +214,7 @@ class FetchMealPolicy(Driver):
         """
         T_map_board, size = self._board
         a = self._microwave.articulation
-        opened = self._joint(a).position - a.lower
+        opened = self._opened(self._microwave)
         hinge = float(apply(inverse(T_map_board), a.anchor[None])[0][1])
         width = float(np.ptp((a.vertices - a.anchor) @ T_map_board[:3, 1]))
         side = self._hinge_side(self._microwave)
@@ -217,10 +235,11 @@ class FetchMealPolicy(Driver):
     # --------------------------------------------------------------------------------------------------------- stances
 
     def _candidates(self, place: Float64, inwards: Float64, side: float = 0.0) -> Iterator[Float64]:
-        """(4, 4) T_map_base from which a place is before the arm, the straightest first, on free floor.
+        """(4, 4) T_map_base from which a place is before the arm, the straightest first, on floor that is free now.
 
         With a `side` of 1 or -1 the place is rather to the left or right of the robot.
         """
+        self._mind_obstacles()
         for turn in TURNS.tolist():
             ahead = turned(inwards, turn)
             for left in sorted(ASIDE, key=lambda left: -side * left):
@@ -298,6 +317,7 @@ class FetchMealPolicy(Driver):
         self._gaze = place
         best: tuple[float, Float64] | None = None
         here = self._belief.localization.T_map_base[:2, 3]
+        self._mind_obstacles()
         for turn in np.deg2rad([0, 20, -20, 40, -40]).tolist():
             for distance in (VIEW, 1.1, 1.4, 0.95, 1.6):
                 xy = (place + distance * turned(outwards, turn))[:2]

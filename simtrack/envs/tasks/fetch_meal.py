@@ -65,7 +65,7 @@ class FetchMeal(Task):
 
     script = "fetch-meal"
     scene = "open_kitchen:0"
-    seconds = 240.0
+    seconds = 360.0
     macros = ("articulate", "take", "insert")
 
     def adapt(self, scene: SceneFile) -> SceneFile:
