@@ -165,3 +165,29 @@ def test_every_package_says_what_it_is_for() -> None:
     for path in MODULES:
         if path.name == "__init__.py":
             assert ast.get_docstring(ast.parse(path.read_text())), f"{path} has no docstring"
+
+
+def compiled_functions() -> dict[str, tuple[ast.FunctionDef, dict[str, ast.expr]]]:
+    """Name -> definition of every compiled function, and the arguments of its decorator."""
+    found = {}
+    for path in MODULES:
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            for decorator in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
+                if isinstance(decorator, ast.Call) and ast.unparse(decorator.func) in ("njit", "nb.njit"):
+                    found[node.name] = node, {str(k.arg): k.value for k in decorator.keywords}
+    return found
+
+
+def test_kernels_that_may_round_in_several_ways_are_inlined_in_others() -> None:
+    """Otherwise results depend on which kernels a process has compiled before (see `normal_equations`)."""
+    functions = compiled_functions()
+    calls = {
+        name: {ast.unparse(call.func) for call in ast.walk(node) if isinstance(call, ast.Call)} & functions.keys()
+        for name, (node, _) in functions.items()
+    }
+    loose = {name for name, (_, arguments) in functions.items() if "fastmath" in arguments}
+    assert loose
+    while more := {name for name, called in calls.items() if called & loose} - loose:
+        loose |= more
+    called = set.union(*calls.values())
+    assert sorted(name for name in loose & called if "forceinline" not in functions[name][1]) == []

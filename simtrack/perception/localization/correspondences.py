@@ -131,7 +131,7 @@ def kernel_scale(pairs, count, motion, shift, low, high):
     return high
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
 def normal_equations(pairs, weights, count, motion, shift, kernel):
     """Normal equations of point-to-plane registration with a Geman-McClure kernel.
 
@@ -214,7 +214,7 @@ def normal_equations(pairs, weights, count, motion, shift, kernel):
     return H, g, stats
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
 def any_normals(pairs, weights, count, kernel):
     """The information that the same rays would have if their normals pointed anywhere.
 

@@ -2,6 +2,10 @@
 
 Compiled, all instances in one call. See `simtrack.perception.tracking.correspondences` for the pairs; everything is in
 the camera frame.
+
+Kernels whose arithmetic is loosened (`fastmath`) are inlined in those that call them, as are those that do so in turn:
+each module that is compiled has its own copy of what it calls, optimised, and so rounded, in its own way, and which copy
+a process uses would depend on what it has compiled before. Results have to repeat to the last bit.
 """
 
 import numpy as np
@@ -11,7 +15,7 @@ _RUN = 64
 """Pairs of one instance that are linearised together, in vector instructions."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _linearise(points, first, count, R, centre, shift, scale, terms):
     """Rows of `terms`, a column a pair.
 
@@ -45,7 +49,7 @@ def _linearise(points, first, count, R, centre, shift, scale, terms):
         terms[10, i] = root * root * (1.0 - 4.0 * squared / (scale + squared))
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz", "reassoc"})
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz", "reassoc"}, forceinline=True)
 def _add_up(terms, count, H, g, stats):
     """Add the sums over the columns of `terms` to `H` (6, 6), `g` (6,) and `stats` (4,) of one instance."""
     weighted = terms[11]
@@ -73,7 +77,7 @@ def _add_up(terms, count, H, g, stats):
     stats[3] += curvature
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def point_normal_equations(points, count, wanted, centres, rotations, shifts, kernel, H, g, stats):
     """Accumulate robust point-to-plane normal equations of the `wanted` (K,) instances from the first `count` pairs.
 
