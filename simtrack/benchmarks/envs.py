@@ -1,10 +1,13 @@
 """``simtrack bench envs``: steps a second of the environments by observation mode, and what a step is spent on.
 
+Then vectors of environments, in this process and in one each: whether their memory grows over a thousand steps.
+
 A step is a tenth of a second: 50 steps of physics. CPU time counts, because machines are shared; means do, because
 lidar and detector have their turn in every second step. Physics is the same simulation with all sensors off, sensing
 what the sensors add to it, and the rest of a step is perception (the stack, or ideal perception), reward and arrays.
 """
 
+import multiprocessing
 import statistics
 import time
 from collections.abc import Sequence
@@ -12,7 +15,7 @@ from collections.abc import Sequence
 import gymnasium as gym
 import numpy as np
 
-from simtrack.benchmarks.harness import Benchmark, Options, Timing
+from simtrack.benchmarks.harness import Benchmark, Options, Timing, resident
 from simtrack.benchmarks.yardstick import REFERENCE, scaled, yardstick
 from simtrack.contracts import Float32
 from simtrack.envs.loop import BUILDING_SEED, KEY, MEMORY, SCAN_KEY, SERVO
@@ -24,6 +27,8 @@ ASKED = {"state": 150.0, "belief": 60.0, "rgbd": 80.0}
 """Steps a second on one core, of a machine on which the yardstick takes `REFERENCE`."""
 WARM_UP = 30
 """Steps that do not count: kernels are loaded, objects are born."""
+MEMBERS, MEMBER_STEPS, EVERY = 4, 1000, 20
+"""Of a vector: environments, steps of each, and steps between looks at the memory."""
 
 
 def run(options: Options) -> Benchmark:
@@ -36,6 +41,10 @@ def run(options: Options) -> Benchmark:
         for mode, asked in ASKED.items():
             options.say(f"{name}, {mode}")
             _measure(result, f"simtrack/{name}-v0", name, mode, asked / pace, steps, options.seed)
+    for mode in ("belief", "rgbd"):
+        for kind in ("sync", "async"):
+            options.say(f"{MEMBERS} members, {kind}, {mode}")
+            _play_vector(result, mode, kind, 5 * EVERY if options.quick else MEMBER_STEPS, options.seed)
     result.notes.append(
         f"asked are {', '.join(f'{rate:g} ({mode})' for mode, rate in ASKED.items())} where the yardstick (embreex, "
         f"640x480 rays) takes {1e3 * REFERENCE:g} ms; here it took {1e3 * REFERENCE * pace:.0f} ms, and that much less "
@@ -84,6 +93,31 @@ def _play(env: gym.Env, mode: str, steps: int, seed: int) -> tuple[Timing, list[
             observation, _ = env.reset(seed=seed)
             policy.begin(np.random.default_rng(seed))
     return Timing(statistics.fmean(cpu[WARM_UP:]), statistics.fmean(wall[WARM_UP:]), steps), actions
+
+
+def _play_vector(result: Benchmark, mode: str, kind: str, steps: int, seed: int) -> None:
+    """Random actions in a vector of environments whose episodes end and begin anew; memory of all its processes."""
+    context = {"context": "spawn"} if kind == "async" else {}
+    before = {child.pid for child in multiprocessing.active_children()}
+    envs = gym.make_vec("simtrack/ActivePerception-v0", MEMBERS, kind, vector_kwargs=context, observation=mode)
+    try:
+        envs.action_space.seed(seed)
+        envs.reset(seed=seed)
+        children = [child.pid for child in multiprocessing.active_children() if child.pid not in before]
+        memory, started = [], time.perf_counter()
+        for step in range(steps):
+            envs.step(envs.action_space.sample())
+            if step % EVERY == EVERY - 1:
+                memory.append(sum(resident(process) for process in (None, *children)))
+        wall = (time.perf_counter() - started) / (MEMBERS * steps)
+    finally:
+        envs.close()
+    half = len(memory) // 2
+    growth = statistics.median(memory[half:]) / statistics.median(memory[:half])
+    name = f"{MEMBERS} members, {kind}, {mode}"
+    result.add(f"{name}: memory, second half to first", value=growth, unit="x", asked=1.05, note=f"{steps} steps each")
+    result.add(f"{name}: memory", value=memory[-1] / 1e9, unit="GB")
+    result.add(f"{name}: steps a second, all members", value=1.0 / wall, unit="1/s")
 
 
 def _simulate(env: gym.Env, actions: Sequence[Float32], seed: int, on: bool) -> float:

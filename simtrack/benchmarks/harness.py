@@ -102,6 +102,12 @@ class Benchmark:
         }
 
 
+def resident(process: int | None = None) -> int:
+    """Bytes of main memory that a process holds; this one, if no number of another is given."""
+    fields = Path(f"/proc/{process or 'self'}/statm").read_text(encoding="utf-8").split()
+    return int(fields[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
 def measure(
     contestants: Mapping[str, Callable[[], object]],
     repeats: int = 15,

@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from simtrack.benchmarks.feed import Feed
-from simtrack.benchmarks.harness import Benchmark, Options
+from simtrack.benchmarks.harness import Benchmark, Options, resident
 from simtrack.contracts import NANOSECONDS, LidarScan, RgbdFrame, SensorFrame
 from simtrack.perception.localization.measurement import scan_end
 from simtrack.perception.pipeline import PerceptionStack
@@ -143,7 +143,7 @@ def _play(stack: PerceptionStack, feed: Feed) -> Play:
             arrived = begin + (frame.stamp - first) / NANOSECONDS
             outcome.latencies.append(time.perf_counter() - arrived)
             if outcome.processed % 30 == 1:
-                outcome.memory.append(_resident())
+                outcome.memory.append(resident())
     outcome.cpu = time.process_time() - (cpu_begin or 0.0)
     return outcome
 
@@ -151,12 +151,6 @@ def _play(stack: PerceptionStack, feed: Feed) -> Play:
 def _arrival(frame: SensorFrame) -> int:
     """Nanoseconds: a scan is complete with its last shot."""
     return scan_end(frame) if isinstance(frame, LidarScan) else frame.stamp
-
-
-def _resident() -> int:
-    import os
-
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _report(result: Benchmark, best: Play, tried: list[Play]) -> None:

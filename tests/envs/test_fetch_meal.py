@@ -107,6 +107,15 @@ def test_check_env_finds_nothing(env: SimtrackEnv) -> None:
     check_env(env, skip_render_check=True)
 
 
+@pytest.mark.slow
+def test_check_env_finds_nothing_in_what_is_believed_and_seen(kitchen: Path) -> None:
+    made = gym.make(
+        "simtrack/FetchMeal-v0", scene=str(kitchen), observation=("belief", "rgbd"), render_mode="rgb_array", seconds=60
+    )
+    with made:
+        check_env(simtrack_env(made))
+
+
 def test_the_arm_opens_the_fridge_and_takes_the_item_through_physics(env: SimtrackEnv) -> None:
     env.reset(seed=3)
     stand(env, -0.8, 0.0)
