@@ -85,11 +85,10 @@ class Loop:
 
     def restart(self, seed: int) -> None:
         """Begin an episode; everything random is drawn from `seed`."""
-        simulation = self.simulation
-        simulation.restart(seed)
-        self._ideal.reset()
         if self.manipulator is not None:
-            self.manipulator.reset()
+            self.manipulator.reset()  # first: what the cup holds does not come to rest as other things do
+        self.simulation.restart(seed)
+        self._ideal.reset()
         self._belief = self._image = None
         if self.has_stack:
             old, self._stack = self._stack, self._make_stack(seed)

@@ -70,7 +70,7 @@ class Manipulator:
         self.reset()
 
     def reset(self) -> None:
-        """The world has begun anew, with the arm tucked."""
+        """The world begins anew, with the arm tucked."""
         self.cup.reset()
         self.outcome = Outcome.IDLE
         """Of the macro that runs or ran last."""

@@ -50,7 +50,7 @@ class SuctionCup:
         """Name of the object, door or drawer that it holds."""
 
     def reset(self) -> None:
-        """Forget what was held: the world has begun anew."""
+        """Forget what was held: the world is about to begin anew."""
         if self.holding is not None:
             self._may_sleep(self.holding, True)
         self.holding = None

@@ -131,6 +131,25 @@ def test_the_arm_opens_the_fridge_and_takes_the_item_through_physics(env: Simtra
     assert env.snapshot.truth.objects["relay"].T_map_object[2, 3] > item[2] + 0.01
 
 
+def test_what_an_episode_held_to_its_end_settles_in_the_next_like_other_things(
+    env: SimtrackEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env.reset(seed=3)
+    assert env.loop is not None
+    simulation = env.loop.simulation
+    policy, restart, seen = simulation.world.model.tree_sleep_policy, simulation.restart, list[list[int]]()
+    usual = policy.tolist()
+    stand(env, -0.8, 0.0)
+    env.step(Request("articulate", in_base(env, np.array([-0.02, -0.2, 0.95])), 1.4).action(env.task.macros))
+    while env.snapshot is not None and env.snapshot.holding is None:
+        assert env.snapshot.felt.macro is Outcome.BUSY
+        env.step(np.zeros(env.action_space.shape or (0,), np.float32))
+    assert policy.tolist() != usual
+    monkeypatch.setattr(simulation, "restart", lambda seed: (seen.append(policy.tolist()), restart(seed)))
+    env.reset(seed=3)
+    assert seen and all(each == usual for each in seen)
+
+
 def test_nothing_moves_where_no_door_is_believed_to_be(env: SimtrackEnv) -> None:
     env.reset(seed=4)
     stand(env, -1.2, -0.8)
