@@ -4,8 +4,8 @@ Compiled, all instances in one call. See `simtrack.perception.tracking.correspon
 the camera frame.
 
 Kernels whose arithmetic is loosened (`fastmath`) are inlined in those that call them, as are those that do so in turn:
-each module that is compiled has its own copy of what it calls, optimised, and so rounded, in its own way, and which copy
-a process uses would depend on what it has compiled before. Results have to repeat to the last bit.
+each module that is compiled has its own copy of what it calls, optimised, and so rounded, in its own way, and which of
+them a process uses would depend on what it has compiled before. Results have to repeat to the last bit.
 """
 
 import numpy as np
