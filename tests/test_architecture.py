@@ -172,7 +172,9 @@ def compiled_functions() -> dict[str, tuple[ast.FunctionDef, dict[str, ast.expr]
     found = {}
     for path in MODULES:
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            for decorator in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            for decorator in node.decorator_list:
                 if isinstance(decorator, ast.Call) and ast.unparse(decorator.func) in ("njit", "nb.njit"):
                     found[node.name] = node, {str(k.arg): k.value for k in decorator.keywords}
     return found
