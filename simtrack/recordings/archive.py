@@ -23,6 +23,9 @@ T = TypeVar("T")
 MAX_BYTES = 2**30
 """Largest archive, unpacked."""
 _MAX_MEMBERS = 100_000
+_BROKEN = (zipfile.BadZipFile, zlib.error, KeyError, EOFError, ValueError, NotImplementedError, RuntimeError, OSError)
+"""What reading a damaged archive raises; ValueError for offsets below zero, RuntimeError for encrypted members and JSON
+nested beyond recursion."""
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the same tree gives the same bytes on every day
 
 
@@ -55,11 +58,12 @@ def decode(kind: type[T] | Any, data: bytes) -> T:
             if len(members) > _MAX_MEMBERS or sum(member.file_size for member in members) > MAX_BYTES:
                 raise ArchiveError(f"unpacks to more than {MAX_BYTES} bytes or {_MAX_MEMBERS} members")
             return _from_tree(kind, json.loads(archive.read("tree.json")), archive, "")
-    except (zipfile.BadZipFile, zlib.error, KeyError, EOFError, NotImplementedError, RuntimeError, OSError) as error:
-        # RuntimeError covers encrypted members and JSON nested beyond recursion.
-        raise ArchiveError(f"not a readable archive: {error}") from error
+    except ArchiveError:
+        raise
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ArchiveError(f"tree.json: {error}") from error
+    except _BROKEN as error:
+        raise ArchiveError(f"not a readable archive: {error}") from error
 
 
 def _member(name: str) -> zipfile.ZipInfo:

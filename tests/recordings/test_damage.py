@@ -246,6 +246,14 @@ def test_damaged_maps_are_named(
         open_recording(forged.close())
 
 
+def test_a_map_whose_members_begin_before_it_is_named(forged: Forged, static_map: StaticMap) -> None:
+    data = bytearray(archive.encode(static_map))
+    data[-4] += 1  # where the directory is said to begin, 65,536 bytes too far
+    forged.attach(layout.STATIC_MAP, bytes(data))
+    with pytest.raises(FileFormatError, match="not a readable archive"):
+        open_recording(forged.close())
+
+
 def test_maps_whose_faces_name_no_vertex_are_named(forged: Forged, static_map: StaticMap) -> None:
     wrong = StaticMap(static_map.vertices, static_map.faces + 1)
     forged.attach(layout.STATIC_MAP, archive.encode(wrong))

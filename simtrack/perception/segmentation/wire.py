@@ -35,7 +35,9 @@ MOST_BYTES = 8 * MOST_PIXELS + 1_000_000
 """Of a request or an answer, packed or not."""
 _ARRAYS = 16
 _HEADER = 4096
-_BROKEN = (zipfile.BadZipFile, OSError, EOFError, NotImplementedError, RuntimeError, struct.error, zlib.error)
+_BROKEN = (
+    zipfile.BadZipFile, OSError, EOFError, ValueError, NotImplementedError, RuntimeError, struct.error, zlib.error,
+)  # fmt: skip
 
 
 def packed_frame(frame: RgbdFrame) -> bytes:
@@ -121,6 +123,8 @@ def _unpacked(data: bytes) -> dict[str, np.ndarray]:
             if len(entries) > _ARRAYS or sum(entry.file_size for entry in entries) > MOST_BYTES:
                 raise InvalidValueError("arrays", len(entries), f"at most {_ARRAYS}, of {MOST_BYTES} bytes together")
             return {entry.filename.removesuffix(".npy"): _read(archive, entry) for entry in entries}
+    except InvalidValueError:
+        raise
     except _BROKEN as error:
         raise InvalidValueError("body", f"{len(data)} bytes", f"an .npz file; {error}") from error
 

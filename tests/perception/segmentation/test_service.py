@@ -190,6 +190,13 @@ def test_whatever_comes_is_read_or_refused(data: st.DataObject) -> None:
             assert wire.unpacked_frame(body).depth.ndim == 2
 
 
+def test_an_archive_whose_members_begin_before_it_is_refused() -> None:
+    packed = bytearray(wire.packed_frame(frame()))
+    packed[-4] += 1  # where the directory is said to begin, 65,536 bytes too far
+    with pytest.raises(InvalidValueError, match="npz"):
+        wire.unpacked_frame(bytes(packed))
+
+
 def test_an_archive_that_unpacks_to_too_much_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     packed = wire.packed_frame(frame())
     monkeypatch.setattr(wire, "MOST_BYTES", 300)
