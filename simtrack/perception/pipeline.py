@@ -21,6 +21,7 @@ Which image that is follows from stamps alone: beliefs are the same with one thr
 """
 
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
@@ -185,13 +186,14 @@ class PerceptionStack:
     def _mesh_localizer(self, static_map: StaticMap, T_map_base: Float64 | None) -> MeshLocalizer:
         """MICP-L in the believed scene: what stands before the map is seen, not taken for the map."""
         scene = self._believed.scene
+        own = weakref.proxy(self)  # the localizer must not hold the stack, or its memory waits for the collector
         localizer = MeshLocalizer(
             static_map,
             self.config.localizer,
             scene,
             map_instance=MAP,
-            lidar_mask=self._own_lidar_shots,
-            depth_mask=self._own_pixels,
+            lidar_mask=lambda scan: own._own_lidar_shots(scan),
+            depth_mask=lambda frame: own._own_pixels(frame),
         )
         if T_map_base is not None:
             localizer.initialise(0, T_map_base)

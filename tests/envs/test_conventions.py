@@ -1,10 +1,12 @@
 """Gymnasium's contracts, executed."""
 
+import gc
 import hashlib
 import json
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Callable
 from typing import Any
 
@@ -88,6 +90,20 @@ def test_vectors_of_environments(mode: str) -> None:
         assert ended == envs.num_envs  # and went on with new episodes
     finally:
         envs.close()
+
+
+def test_an_episode_is_forgotten_when_the_next_begins(make: Make) -> None:
+    env = make(observation="belief")
+    env.reset(seed=0)
+    env.step(np.zeros(5, np.float32))
+    assert env.loop is not None and env.loop.has_stack
+    stack = weakref.ref(env.loop._stack)
+    gc.disable()  # its scenes are large, and none of their memory is known to the collector
+    try:
+        env.reset(seed=1)
+        assert stack() is None
+    finally:
+        gc.enable()
 
 
 def test_closing_twice_leaves_no_thread(make: Make) -> None:
