@@ -5,7 +5,7 @@ from torch import Tensor, nn  # pyright: ignore[reportMissingImports] - extra `t
 from torch.nn import functional  # pyright: ignore[reportMissingImports] - extra `train`
 
 from simtrack.perception.segmentation.panoptic_network import CHANNELS
-from simtrack.training.networks import Residual, convolved, halved
+from simtrack.training.networks import Residual, convolved, halved, in_bfloat16
 
 _WIDTHS = (32, 64, 128, 192)
 """Channels at 4, 8, 16 and 32 pixels a cell."""
@@ -28,6 +28,7 @@ class SegmentNetwork(nn.Module):
         self.places = nn.Sequential(convolved(_JOINED, 32), nn.Conv2d(32, 3, 1))
         nn.init.constant_(self.places[1].bias, 0.0)  # type: ignore[arg-type]
 
+    @in_bfloat16
     def forward(self, shown: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(N, CHANNELS, H, W) to logits (N, classes, H/4, W/4), heat logits (N, 1, ...) and offsets (N, 2, ...)."""
         x = self.stem(shown)

@@ -12,6 +12,7 @@ from tests.training.data import write_dataset
 
 torch = pytest.importorskip("torch", reason="training needs the extra train")
 
+from simtrack.training import networks  # noqa: E402
 from simtrack.training.loop import CHECKPOINT, Budget, Progress, rate, restored_network, train  # noqa: E402
 
 
@@ -119,3 +120,21 @@ def test_both_networks_train_and_answer_alike_in_their_files(tmp_path: Path, mon
     made = KeypointDetector({"relay": relay}, tmp_path / "out")
     assert made.class_names == ("relay",)
     assert sum(path.stat().st_size for path in (tmp_path / "out").glob("*.onnx")) < 12_000_000
+
+
+def test_bfloat16_is_used_while_learning_only_and_is_close(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(networks, "bfloat16_is_native", lambda: True)
+    torch.manual_seed(3)
+    network = networks.BoxNetwork(2).train()
+    image = torch.randn(2, 5, 64, 64)
+    halved = network(image)
+    assert all(answer.dtype == torch.float32 for answer in halved)
+    monkeypatch.setattr(networks, "bfloat16_is_native", lambda: False)
+    exact = network(image)
+    assert not torch.equal(halved[0], exact[0])
+    for a, b in zip(halved, exact, strict=True):
+        assert torch.linalg.norm(a - b) < 0.05 * torch.linalg.norm(b)
+    network.eval()
+    told = network(image)
+    monkeypatch.setattr(networks, "bfloat16_is_native", lambda: True)
+    assert all(torch.equal(a, b) for a, b in zip(network(image), told, strict=True))
