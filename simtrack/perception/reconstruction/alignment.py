@@ -17,6 +17,8 @@ from simtrack.perception.reconstruction.residuals import footprint_outside, plan
 
 UNKNOWNS = ("log scale", "yaw", "x", "y")
 """What is solved for: x and y are those of the model's centre in the frame of the box."""
+LEVEL = float(np.cos(np.radians(25.0)))
+"""|z| of the normal of a plane that counts as level."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,12 @@ class PlanePairs:
     """(K,), not scaled."""
     weights: Float64
     """(K,)."""
+
+    def level(self) -> "PlanePairs":
+        """Those of which both planes are level within 25 degrees."""
+        kept = np.minimum(np.abs(self.normals[:, 2]), np.abs(self.model_normals[:, 2])) >= LEVEL
+        ours, theirs = (self.normals[kept], self.offsets[kept]), (self.model_normals[kept], self.model_offsets[kept])
+        return PlanePairs(*ours, *theirs, self.weights[kept])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

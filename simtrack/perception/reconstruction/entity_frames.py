@@ -21,6 +21,8 @@ PARALLEL = float(np.cos(np.radians(12.0)))
 """Between upright surfaces of a carcass and its box; what is turned more is a door that stands open."""
 LEANS = float(np.sin(np.radians(4.0)))
 """Sine of the angle off upright and off level from which a plane leans."""
+TRIANGLES = 10
+"""Of a mesh from which it tells how a thing leans; a whole box has twelve."""
 FLAT = 0.6
 """Share of the largest side of its box that a plane must fill for a thing to be turned that was not seen to lean."""
 LEVEL, BESIDE = float(np.cos(np.radians(3.0))), 0.1
@@ -62,9 +64,10 @@ def _flat(node: EntityNode) -> bool:
 def leaning_turn(node: EntityNode) -> Float64 | None:
     """(4, 4) turn about the middle of its box by which a thing leans, seen by its largest plane.
 
-    None if that is nearly upright or level, or if the thing has a level plane, too: monitors have slanting screens.
+    None if that is nearly upright or level, if the thing has a level plane, too (monitors have slanting screens), or if
+    only a few triangles of it were seen.
     """
-    if not node.planes:
+    if not node.planes or node.shape is None or len(node.shape.mesh.faces) < TRIANGLES:
         return None
     largest = max(node.planes, key=lambda plane: plane.area)
     leaning = largest.normal

@@ -1,5 +1,6 @@
 """One oriented model against one entity: where it starts, its alignment, and the errors that rank it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,12 +17,11 @@ from simtrack.perception.reconstruction.alignment import (
     PointPairs,
     solve,
 )
+from simtrack.perception.reconstruction.clearances import SIDES, wall_clearances
 from simtrack.perception.reconstruction.matching import ORIENTATIONS, CadMatch
 from simtrack.perception.reconstruction.surfaces import FACING, TOLERANCE, ModelSurface, SurfacePoints, model_surface
-from simtrack.perception.scene_graph.contact import ContactGraph, EntityNode, SupportKind
+from simtrack.perception.scene_graph.contact import ContactGraph, EntityKind, EntityNode, SupportKind
 
-SIDES: Float64 = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-"""(4, 2) directions of the upright sides of a box."""
 OPENINGS = (0.25, 0.5, 0.75)
 """Shares of the range of a joint that are tried."""
 OPENED = 0.9
@@ -32,6 +32,8 @@ PROPORTIONS = 0.3
 """What a side of the box that is larger or smaller by a factor of e adds to the error, relative to it."""
 YAW_STARTS = (0.0, -np.pi / 6, np.pi / 6)
 """Where the yaw of what is no box starts: its smallest box may be turned against it."""
+ALL_ROUND = tuple(float(turn) for turn in np.arange(12) * (np.pi / 6))
+"""The same over all of the circle."""
 DENSE = 5
 """Points of an entity's surface that a model's are compared with, for every point that is aligned."""
 SPARSE = 3
@@ -53,6 +55,8 @@ class EntityView:
     """More points, among which a model's find their nearest."""
     tied: bool
     """Whether it stands on the lower side of its box."""
+    to_walls: Float64
+    """(4,) metres from each of `SIDES` of its box to a wall; inf where there is none."""
 
     @staticmethod
     def of(node: EntityNode, graph: ContactGraph, samples: int) -> "EntityView":
@@ -65,7 +69,7 @@ class EntityView:
         normals = points.normals @ T[:3, :3].T @ R_box
         few = SurfacePoints(places[:samples], normals[:samples])
         tied = graph.supports[node.name].kind is not SupportKind.HUNG
-        return EntityView(node, few, SurfacePoints(places, normals), tied)
+        return EntityView(node, few, SurfacePoints(places, normals), tied, wall_clearances(node.box, graph))
 
     @property
     def extents(self) -> Float64:
@@ -161,21 +165,26 @@ def coarse_fit(view: EntityView, match: CadMatch, config: AlignmentConfig) -> Fi
     return _rated(view, match, surface, problem, solve(problem, problem.start))
 
 
-def refined(view: EntityView, fit: Fit, config: AlignmentConfig) -> Fit:
-    """Align a model further with the points of the entity's surface, which find their counterparts anew in rounds."""
-    turns = YAW_STARTS if not view.boxy and len(fit.match.model.yaw_symmetries) < _ROUND else (0.0,)
+def refined(view: EntityView, fit: Fit, config: AlignmentConfig, starts: Sequence[float] = YAW_STARTS) -> Fit:
+    """Align a model further with the points of the entity's surface, which find their counterparts anew in rounds.
+
+    The yaw of what is no box is tried from each of the `starts`, radians.
+    """
+    turns = starts if not view.boxy and len(fit.match.model.yaw_symmetries) < _ROUND else (0.0,)
     return min((fit, *(_from(view, fit, turn, config) for turn in turns)), key=lambda found: found.error)
 
 
 def _from(view: EntityView, fit: Fit, turn: float, config: AlignmentConfig) -> Fit:
     """The refined fit when its yaw starts `turn` radians off.
 
-    The footprint of what is no box says nothing of its yaw: a cup's box is turned as its handle and its rim happen to
-    fill it best.
+    Footprint and upright planes of what is no box say nothing of its yaw: a cup's box is turned as its handle and its
+    rim happen to fill it best, and its planes are flat strips of something round. What has doors has planes that tell.
     """
     if not view.boxy:
         config = replace(config, footprint_weight=0.0)
     problem = _problem(view, fit.match, config)
+    if not view.boxy and view.node.kind is not EntityKind.ARTICULATED:
+        problem = replace(problem, planes=problem.planes.level())
     unknowns = fit.unknowns + [0.0, turn, 0.0, 0.0]
     for _ in range(config.rounds):
         previous = unknowns
@@ -208,14 +217,16 @@ def with_open_joints(view: EntityView, fit: Fit, config: AlignmentConfig) -> Fit
 
 def _problem(view: EntityView, match: CadMatch, config: AlignmentConfig) -> AlignmentProblem:
     """Eq. 12 for an oriented model; it starts with the entity's height, in the middle of the box, or, where a side of
-    that is open, against the opposite side.
+    that is open, against the opposite side. Behind an open side the model may go on as far as the wall.
     """
     R = ORIENTATIONS[match.orientation]
     extents = np.abs(R) @ match.model.extents
     scale = float(view.extents[2] / extents[2])
-    half, beyond = 0.5 * view.extents[:2], np.where(view.open_sides, view.diagonal, 0.0)
-    excess = np.maximum(scale * extents[:2] - view.extents[:2], 0.0) / 2
-    centre = excess * (view.open_sides[:2].astype(float) - view.open_sides[2:].astype(float))
+    half = 0.5 * view.extents[:2]
+    beyond = np.where(view.open_sides, np.minimum(view.to_walls, view.diagonal), 0.0)
+    excess = np.tile(np.maximum(scale * extents[:2] - view.extents[:2], 0.0) / 2, 2)
+    towards = np.where(view.open_sides, np.clip(beyond - excess, -excess, excess), 0.0)
+    centre = towards[:2] - towards[2:]
     return AlignmentProblem(
         footprint=np.stack([-half - beyond[2:], half + beyond[:2]]),
         height=float(view.extents[2]),

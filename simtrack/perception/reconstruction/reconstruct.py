@@ -26,7 +26,7 @@ from simtrack.perception.reconstruction.resting import ReconstructionConfig, Res
 from simtrack.perception.reconstruction.selection import Rejection, Selection, select
 from simtrack.perception.reconstruction.snapping import Snapped, eq1_residuals
 from simtrack.perception.scene_graph.contact.graph import ContactGraph, is_far_above, is_layout
-from simtrack.perception.scene_graph.contact.nodes import FLOOR, SCENE, EntityNode
+from simtrack.perception.scene_graph.contact.nodes import FLOOR, SCENE, EntityKind, EntityNode
 
 Shortlist = Callable[[EntityNode, ContactGraph, Sequence[CadModel]], Sequence[CadCandidate]]
 """Aligned candidates of a node among models of its class, by rising alignment error."""
@@ -230,6 +230,8 @@ def _offer_own_meshes(
     found = False
     for name, children in selection.homeless.items():
         walled = name in selection.in_layout
+        if graph.nodes[name].kind is EntityKind.ARTICULATED:
+            continue
         if not (children or walled) or any(is_own(candidate) for candidate in shortlists[name]):
             continue
         say(f"decomposing {name}", 0.85)

@@ -47,7 +47,7 @@ class SelectionConfig:
     """The same for any place at all."""
     aside: float = 0.15
     """How far beside a face a child may stand to have a place there: snapping brings it on."""
-    wall_depth: float = 0.06
+    wall_depth: float = 0.09
     """How far a candidate may stand in layout: snapping pushes it out."""
     overlap_depth: float = 0.01
     """How deep two candidates may be in each other: snapping pushes them apart."""

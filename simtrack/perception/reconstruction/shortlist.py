@@ -9,7 +9,6 @@ at whether the front could be used.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -17,18 +16,24 @@ from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.boxes import OrientedBox
 from simtrack.geometry.meshes import face_areas, face_normals
-from simtrack.geometry.transforms import apply
 from simtrack.geometry.upright_boxes import MIN_SIDE
 from simtrack.objects.cad import CadModel
 from simtrack.perception.reconstruction.alignment import AlignmentConfig
 from simtrack.perception.reconstruction.candidates import CadCandidate
+from simtrack.perception.reconstruction.clearances import SIDES, furniture_clearances
 from simtrack.perception.reconstruction.entity_frames import frames
-from simtrack.perception.reconstruction.fitting import SIDES, EntityView, Fit, coarse_fit, refined, with_open_joints
+from simtrack.perception.reconstruction.fitting import (
+    ALL_ROUND,
+    YAW_STARTS,
+    EntityView,
+    Fit,
+    coarse_fit,
+    refined,
+    with_open_joints,
+)
 from simtrack.perception.reconstruction.matching import UPRIGHT, MatchingConfig, matches
 from simtrack.perception.scene_graph.contact import ContactGraph, EntityKind, EntityNode
 
-_WALL_AREA = 0.5
-"""Square metres of the planes that count as walls."""
 FACING_THE_ROOM = {"monitor": 0.5, "sofa": 0.5}
 """Class of what is looked at or sat on from its front -> metres that its front needs to a wall."""
 _UNSEEN_SIDES = 2
@@ -60,6 +65,11 @@ class ShortlistConfig:
     unseen_front: float = 0.3
     """Factor, added to 1, on the error of an articulated candidate whose front nobody saw where its rear was seen:
     rears stand against walls."""
+    rear_off_wall: float = 0.5
+    """Factor, added to 1, on the error of an articulated candidate that turns its side to a wall and its rear to none:
+    what is opened is put up with its rear at a wall."""
+    turned: int = 4
+    """Best models of which every yaw is tried on what is no box: its box tells nothing of it."""
     natural_size: float = 0.25
     """What a scale that is off by a factor of e adds to the error, relative to it: things have their usual sizes."""
     opened: int = 3
@@ -67,7 +77,16 @@ class ShortlistConfig:
     box is not that of the carcass: something stands open."""
 
     def __post_init__(self) -> None:
-        for name in ("upright", "tipped", "opened", "access", "unseen_front", "natural_size"):
+        for name in (
+            "upright",
+            "tipped",
+            "turned",
+            "opened",
+            "access",
+            "unseen_front",
+            "rear_off_wall",
+            "natural_size",
+        ):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InvalidValueError(f"ShortlistConfig.{name}", getattr(self, name), "0 or more")
         if not 0.0 < self.advantage <= 1.0 or not 1.0 <= self.blocked_front < np.inf:
@@ -102,7 +121,7 @@ def shortlist(
     openable = 0 if node.kind is not EntityKind.ARTICULATED else config.opened if len(framed) == 1 else top
     for seen, T_back in framed:
         view = EntityView.of(seen, graph, config.alignment.samples)
-        free = front_clearances(view, graph)
+        free = furniture_clearances(view.node, graph)
         for fit in _fits(view, graph, models, free, config, top, openable):
             error = view.diagonal * ranking_error(fit, view, free, config)
             found.append((error, _candidate(view, fit, T_back)))
@@ -126,9 +145,21 @@ def _fits(
         for match in matches(view.node, graph, models, config.matching, count, upright=upright)
     ]
     ranked = _ranked(fits, view, free, config)[:top]
-    ranked = _ranked([refined(view, fit, config.alignment) for fit in ranked], view, free, config)
+    best = _best_of_models(ranked, config.turned)
+    starts = {} if view.node.kind is EntityKind.ARTICULATED else {id(fit): ALL_ROUND for fit in best}
+    refitted = [refined(view, fit, config.alignment, starts.get(id(fit), YAW_STARTS)) for fit in ranked]
+    ranked = _ranked(refitted, view, free, config)
     opened = [with_open_joints(view, fit, config.alignment) for fit in ranked[:openable]]
     return _ranked([*opened, *ranked[openable:]], view, free, config)
+
+
+def _best_of_models(ranked: Sequence[Fit], count: int) -> list[Fit]:
+    """The first upright fit of each of the first `count` models."""
+    first: dict[str, Fit] = {}
+    for fit in ranked:
+        if fit.match.orientation in UPRIGHT:
+            first.setdefault(fit.match.model.name, fit)
+    return list(first.values())[:count]
 
 
 def could_lie(view: EntityView) -> bool:
@@ -172,7 +203,7 @@ def ranking_error(fit: Fit, view: EntityView, free: Float64, config: ShortlistCo
     Args:
         fit: an aligned model.
         view: the entity.
-        free: (4,) metres from each of `SIDES` to a wall.
+        free: (4,) metres from each of `SIDES` to furniture before it.
         config: the factors.
     """
     error = fit.error * (1.0 + config.natural_size * abs(float(fit.unknowns[0])))
@@ -183,55 +214,18 @@ def ranking_error(fit: Fit, view: EntityView, free: Float64, config: ShortlistCo
         return error
     side = int(np.argmax(SIDES @ -fit.T_box_model[:2, 1]))
     access = config.access if model.articulated else FACING_THE_ROOM[model.semantic_class]
-    if free[side] < access <= free[(side + 2) % 4]:
+    behind = (side + 2) % 4
+    if view.to_walls[side] < access <= view.to_walls[behind]:
         error *= config.blocked_front
     if not model.articulated:
         return error
-    front, rear = view.facing_sides[side], view.facing_sides[(side + 2) % 4]
+    if free[side] < access <= free[behind]:
+        error *= config.blocked_front
+    beside = min(view.to_walls[(side + 1) % 4], view.to_walls[(side + 3) % 4])
+    if beside < access <= view.to_walls[behind]:
+        error *= 1.0 + config.rear_off_wall
+    front, rear = view.facing_sides[side], view.facing_sides[behind]
     return error * (1.0 + config.unseen_front * max(0.0, rear - front) / max(rear + front, 1e-9))
-
-
-def front_clearances(view: EntityView, graph: ContactGraph) -> Float64:
-    """(4,) metres from each of the upright sides of the box to the wall before it; inf where there is none."""
-    T, half = view.node.box.T_map_box, 0.5 * view.extents
-    directions = np.column_stack([SIDES, np.zeros(4)]) @ T[:3, :3].T
-    middles = T[:3, 3] + (np.abs(SIDES) @ half[:2])[:, None] * directions
-    free = np.full(4, np.inf)
-    walls = _wall_planes(graph)
-    facing = directions @ walls.normals.T < -0.7
-    distances = middles @ walls.normals.T + walls.offsets
-    for side, wall in np.argwhere(facing).tolist():
-        at = (middles[side] - distances[side, wall] * walls.normals[wall])[:2]
-        if (at >= walls.low[wall] - 0.05).all() and (at <= walls.high[wall] + 0.05).all():
-            free[side] = min(free[side], max(float(distances[side, wall]), 0.0))
-    return free
-
-
-@dataclass(frozen=True, slots=True)
-class _WallPlanes:
-    """Upright planes of layout: (N, 3) normals, (N,) offsets, (N, 2) lower and upper corners of x, y."""
-
-    normals: Float64
-    offsets: Float64
-    low: Float64
-    high: Float64
-
-
-@lru_cache(maxsize=2)
-def _wall_planes(graph: ContactGraph) -> _WallPlanes:
-    found = [
-        (plane, apply(wall.T_map_entity, outline)[:, :2])
-        for wall in graph.nodes.values()
-        if wall.kind is EntityKind.LAYOUT and wall.shape is not None
-        for plane, outline in zip(wall.planes, wall.shape.outlines, strict=False)
-        if abs(plane.normal[2]) < 0.1 and plane.area > _WALL_AREA
-    ]
-    return _WallPlanes(
-        np.array([plane.normal for plane, _ in found]).reshape(-1, 3),
-        np.array([plane.offset for plane, _ in found]),
-        np.array([corners.min(axis=0) for _, corners in found]).reshape(-1, 2),
-        np.array([corners.max(axis=0) for _, corners in found]).reshape(-1, 2),
-    )
 
 
 def _candidate(view: EntityView, fit: Fit, T_back: Float64) -> CadCandidate:

@@ -169,15 +169,28 @@ def test_the_floor_goes_on_under_what_stands_on_it() -> None:
     assert slab.mesh.bounds[1, 0] >= 1.35
 
 
-def test_where_no_model_has_a_place_for_what_is_inside_the_own_mesh_has() -> None:
-    """A bookcase whose only model is a solid block."""
+def test_what_opens_keeps_a_model_though_it_has_no_place_for_what_is_inside() -> None:
+    """Its own mesh would have no doors."""
+    solid = table_model("table-solid", (0.84, 0.3, 0.9))
+    graph = corner(case=("cabinet", shelf_mesh()), cup=("cup", block((0.08, 0.08, 0.1), (0.0, 0.0, 0.46))))
+    made = reconstruct(graph, shortlist=lambda node, graph, models: [CadCandidate(solid, node.box.T_map_box, 1.0)]
+                       if node.name == "case" else [])  # fmt: skip
+    assert made.choices["case"].candidate.model is solid
+    assert made.choices["cup"].own_mesh
+
+
+def shelf_mesh() -> Mesh:
     boards = [block((0.02, 0.3, 0.9), (x, 0.0, 0.0)) for x in (-0.41, 0.41)]
     boards += [block((0.8, 0.3, 0.02), (0.0, 0.0, z)) for z in (0.0, 0.44, 0.88)]
-    shelf = Mesh(
+    return Mesh(
         np.concatenate([board.vertices for board in boards]),
         np.concatenate([board.faces + 8 * k for k, board in enumerate(boards)]),
     )
-    graph = corner(case=("table", shelf), cup=("cup", block((0.08, 0.08, 0.1), (0.0, 0.0, 0.46))))
+
+
+def test_where_no_model_has_a_place_for_what_is_inside_the_own_mesh_has() -> None:
+    """A bookcase whose only model is a solid block."""
+    graph = corner(case=("table", shelf_mesh()), cup=("cup", block((0.08, 0.08, 0.1), (0.0, 0.0, 0.46))))
     assert graph.parent("cup") == "case"
     solid = table_model("table-solid", (0.84, 0.3, 0.9))
     made = reconstruct(graph, shortlist=lambda node, graph, models: [CadCandidate(solid, node.box.T_map_box, 1.0)]
