@@ -17,6 +17,8 @@ def evaluate(
     stages: Literal["graph", "models", "physics"] = "physics",
     method: Literal["full", "no-joint-fusion", "voxbloxpp", "all"] = "all",
     strength: float = 1.0,
+    segmenter: str = "oracle",
+    poses: Literal["true", "estimated", "noisy"] = "true",
     frames: int = 300,
     voxel: float = 0.02,
     out: Path = Path("reports"),
@@ -38,6 +40,8 @@ def evaluate(
         stages: Of a reconstruction: the contact graph alone, CAD models too, or the check of physics as well.
         method: Of a map: full, one of those that it is compared with, or all of them.
         strength: Of the errors of the oracle that segments the images, 0 to 3.
+        segmenter: Of a map: oracle, learned (the network that comes along), or what `simtrack map` takes.
+        poses: Of a map's camera: true, estimated by odometry from the images, or noisy.
         frames: Of each room's film.
         voxel: Metres, of the maps.
         out: Folder for the results, WHAT.json and WHAT.txt.
@@ -57,7 +61,7 @@ def evaluate(
     if what == "detector":
         return _detector(data, detector, count, out)
     if what == "panoptic":
-        return _panoptic(rooms, method, strength, frames, voxel, out, folder)
+        return _panoptic(rooms, method, strength, segmenter, poses, frames, voxel, out, folder)
     return _reconstruction(rooms, entities, stages, out, folder, workers)
 
 
@@ -86,7 +90,15 @@ def _detector(data: Path | None, detector: str, count: int | None, out: Path) ->
 
 
 def _panoptic(
-    rooms: str, method: "Method | Literal['all']", strength: float, frames: int, voxel: float, out: Path, work: Path
+    rooms: str,
+    method: "Method | Literal['all']",
+    strength: float,
+    segmenter: str,
+    poses: Literal["true", "estimated", "noisy"],
+    frames: int,
+    voxel: float,
+    out: Path,
+    work: Path,
 ) -> int:
     from simtrack.cli import console
     from simtrack.errors import InvalidValueError
@@ -101,7 +113,8 @@ def _panoptic(
     FilmConfig(frames=frames)  # refuse bad values before hours of work
     VolumeConfig(voxel=voxel)
     methods = METHODS if method == "all" else (method,)
-    tasks = [RoomMapTask(seed, kitchen, methods, strength, frames, voxel) for seed, kitchen in parse_rooms(rooms)]
+    how = {"strength": strength, "frames": frames, "voxel": voxel, "segmenter": segmenter, "poses": poses}
+    tasks = [RoomMapTask(seed, kitchen, methods, **how) for seed, kitchen in parse_rooms(rooms)]
     with console.ProgressLine("evaluate panoptic", "looking for rooms that are done") as line:
         try:
             done, failed = evaluate_maps(tasks, work, line.show)

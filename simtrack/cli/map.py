@@ -31,8 +31,8 @@ def map_command(
         source: A furnished room such as rooms:7 or kitchen:2, which is filmed, or a recording with poses.
         out: Folder for the results; runs/map-SOURCE if not given.
         segmenter: Who segments the images: oracle (knows the truth, and errs like a network), the default for rooms;
-            none, the default for recordings: geometry alone is mapped; a folder that `simtrack train segmenter` wrote,
-            a service at http://HOST:PORT, or package.module:Class.
+            none, the default for recordings: geometry alone is mapped; learned, the network that comes along; a folder
+            that `simtrack train segmenter` wrote, a service at http://HOST:PORT, or package.module:Class.
         poses: Of the camera: true, as the film or the recording states them; estimated, by RGB-D odometry from the
             images alone; noisy, the stated ones with the errors of a SLAM system.
         strength: Of the oracle's errors, 0 to 3; 1 is fixed so that the map without joint fusion is as good as the

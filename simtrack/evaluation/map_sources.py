@@ -11,7 +11,7 @@ import numpy as np
 from simtrack.contracts import Float64, Int32, RgbdFrame
 from simtrack.errors import InvalidValueError
 from simtrack.perception.mapping.odometry.rgbd_odometry import RgbdOdometry
-from simtrack.perception.segmentation.loading import ALLOWED, make_segmenter
+from simtrack.perception.segmentation.loading import ALLOWED, LEARNED, make_segmenter
 from simtrack.perception.segmentation.panoptic import PanopticSegments, Segmenter
 from simtrack.simulation.building.rooms.film import FilmConfig, FilmFrame, RoomFilm
 from simtrack.simulation.building.rooms.physics import SettledRoom
@@ -180,15 +180,21 @@ def map_source(
         raise InvalidValueError("source", source, "a furnished room such as rooms:7, or a folder of RGB-D images")
     number = scene.static.seed if scene.static.seed is not None else seed
     kind = kind_of(scene.static.config)
-    chosen = None if segmenter in (None, ORACLE) else _segmenter(segmenter)  # before a room is built
+    if segmenter not in (None, ORACLE):
+        _segmenter(segmenter)  # refuses bad values before a room is built
     made = room_source(number, kind, film, strength, seed, f"{scene.name}-{number}")
-    return with_poses(made if chosen is None else replace(made, segmenter=chosen), poses, seed)
+    return with_poses(with_segmenter(made, segmenter or ORACLE), poses, seed)
+
+
+def with_segmenter(source: MapSource, segmenter: str) -> MapSource:
+    """A source that is segmented by another one than its own, the oracle; see `map_source`."""
+    return source if segmenter == ORACLE else replace(source, segmenter=_segmenter(segmenter))
 
 
 def _segmenter(given: str) -> Segmenter:
     if given == NONE:
         return NoSegmenter()
-    if not (":" in given or given.endswith(".onnx") or Path(given).is_dir()):
+    if not (given == LEARNED or ":" in given or given.endswith(".onnx") or Path(given).is_dir()):
         raise InvalidValueError("segmenter", given, f"{ORACLE}, {NONE}, {ALLOWED}")
     return make_segmenter(given)
 

@@ -3,7 +3,9 @@
 What came of a room is kept in a file as soon as it is there; results of other code are made anew.
 """
 
+import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -13,12 +15,14 @@ from typing import Any
 import numpy as np
 
 from simtrack.errors import InvalidValueError, SimtrackError
-from simtrack.evaluation.map_sources import room_source
+from simtrack.evaluation.map_sources import ORACLE, Poses, room_source, with_poses, with_segmenter
 from simtrack.evaluation.mapping import MapScores, class_means, map_scenes, score_map, score_metrics
 from simtrack.evaluation.metrics import write_atomically
 from simtrack.evaluation.panoptic import PAPER_CLASSES, STUFF, PanopticCount, ScoredClass, mean_precision
 from simtrack.evaluation.workers import code_digest
 from simtrack.perception.mapping.panoptic.panoptic_map import Method, PanopticMapConfig
+from simtrack.perception.segmentation.learned import network_file
+from simtrack.perception.segmentation.loading import LEARNED
 from simtrack.simulation.building.rooms.film import FilmConfig
 
 Results = Mapping[str, MapScores]
@@ -36,6 +40,9 @@ class RoomMapTask:
     frames: int
     voxel: float
     sensor: str = "xtion"
+    segmenter: str = ORACLE
+    """As `simtrack.evaluation.map_sources.map_source` takes it."""
+    poses: Poses = "true"
 
     @property
     def room(self) -> str:
@@ -45,15 +52,29 @@ class RoomMapTask:
     @property
     def file(self) -> str:
         """Name of the file that its outcome is kept in."""
-        methods = "-".join(self.methods)
-        return (
-            f"{self.room.replace(':', '-')}-{self.strength:g}-{self.frames}-{self.voxel:g}-{self.sensor}-{methods}.json"
-        )
+        parts = (self.room.replace(":", "-"), f"{self.strength:g}", str(self.frames), f"{self.voxel:g}", self.sensor)
+        return "-".join((*parts, *self.methods)) + self.variant.replace("_", "-") + ".json"
+
+    @property
+    def variant(self) -> str:
+        """What sets it apart from the oracle's segments on true poses, as part of a file's name."""
+        segmenter = "" if self.segmenter == ORACLE else "_" + re.sub(r"[^A-Za-z0-9]+", "-", self.segmenter).strip("-")
+        strength = "" if segmenter or self.strength == 1.0 else f"_strength-{self.strength:g}"
+        return segmenter + strength + ("" if self.poses == "true" else f"_{self.poses}")
+
+    def code(self) -> str:
+        """Hash of what the outcome follows from, beside the fields: the package's code, and the network."""
+        if self.segmenter != LEARNED and not Path(self.segmenter).exists():
+            return code_digest()
+        file = network_file(None if self.segmenter == LEARNED else Path(self.segmenter))
+        network = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+        return f"{code_digest()}-{network[:16]}"
 
     def run(self, progress: Callable[[int, int], None] | None = None) -> dict[str, MapScores]:
         """Map and compare; the contact graph is built of the full method's map alone."""
         film = FilmConfig(frames=self.frames, sensor=self.sensor)
-        source = room_source(self.seed, "kitchen" if self.kitchen else None, film, self.strength)
+        room = room_source(self.seed, "kitchen" if self.kitchen else None, film, self.strength)
+        source = with_poses(with_segmenter(room, self.segmenter), self.poses)
         configs = [PanopticMapConfig.of_method(method, self.voxel) for method in self.methods]
         mapped = map_scenes(source, configs, progress)
         scores = {}
@@ -83,10 +104,11 @@ def evaluate_maps(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InvalidValueError("work", str(folder), f"a folder that can be written ({error.strerror})") from error
-    code, say = code_digest(), report or (lambda what, share: None)
+    say = report or (lambda what, share: None)
     done: dict[RoomMapTask, Results] = {}
     failed: list[tuple[str, str]] = []
     for number, task in enumerate(tasks):
+        code = task.code()
         with suppress(OSError, ValueError, KeyError, TypeError):
             document = json.loads((folder / task.file).read_text(encoding="utf-8"))
             if document["code"] == code:
@@ -240,20 +262,25 @@ def ordering(done: Mapping[RoomMapTask, Results], better: str, worse: str) -> tu
 
 
 def write_panoptic(done: Mapping[RoomMapTask, Results], folder: Path) -> list[str]:
-    """Write ``panoptic.json`` (figures and rooms) and ``panoptic.txt`` (tables); returns their names."""
+    """Write ``panoptic.json`` (figures and rooms) and ``panoptic.txt`` (tables); returns their names.
+
+    Other segmenters, strengths and poses than the oracle's 1 on true poses are in the names: ``panoptic_learned.json``.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     methods = list(dict.fromkeys(m for results in done.values() for m in results))
     total = {m: summed([r[m] for r in done.values() if m in r]) for m in methods}
     first = next(iter(done))
     how = {"strength": first.strength, "frames": first.frames, "voxel": first.voxel, "sensor": first.sensor}
+    how |= {"segmenter": first.segmenter, "poses": first.poses}
+    names = [f"panoptic{first.variant}.{suffix}" for suffix in ("json", "txt")]
     document = {
         "how": how,
         "figures": {m: {k: asdict(v) for k, v in score_metrics(s).items()} for m, s in total.items()},
         "rooms": [{"room": t.room, "scores": {m: scores_to_json(s) for m, s in r.items()}} for t, r in done.items()],
     }
-    write_atomically(folder / "panoptic.json", json.dumps(document) + "\n")
+    write_atomically(folder / names[0], json.dumps(document) + "\n")
     lines = [f"{len(done)} rooms, {first.frames} frames each ({first.sensor}), voxels of {1e3 * first.voxel:g} mm, "
-             f"oracle at strength {first.strength:g}", ""]  # fmt: skip
+             f"{_told_of(first)}", ""]  # fmt: skip
     for title, (columns, rows) in tables_of(done, total).items():
         wide = [max(len(row[k]) for row in (columns, *rows)) for k in range(len(columns))]
         lines += [
@@ -270,8 +297,13 @@ def write_panoptic(done: Mapping[RoomMapTask, Results], folder: Path) -> list[st
         for name, metric in score_metrics(scores).items():
             value = f"({metric.reason})" if metric.value is None else f"{metric.value:.4g} {metric.unit}"
             lines.append(f"  {name:<40} {value}")
-    write_atomically(folder / "panoptic.txt", "\n".join(lines) + "\n")
-    return ["panoptic.json", "panoptic.txt"]
+    write_atomically(folder / names[1], "\n".join(lines) + "\n")
+    return names
+
+
+def _told_of(task: RoomMapTask) -> str:
+    by = f"oracle at strength {task.strength:g}" if task.segmenter == ORACLE else f"segmenter {task.segmenter}"
+    return by + ("" if task.poses == "true" else f", {task.poses} poses")
 
 
 def tables_of(

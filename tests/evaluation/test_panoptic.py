@@ -1,5 +1,8 @@
 """Panoptic quality and average precision: what is perfect scores 1, and every kind of mistake costs what it should."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -23,6 +26,7 @@ from simtrack.evaluation.panoptic_rooms import (
     scores_to_json,
     summed,
     tables_of,
+    write_panoptic,
 )
 from simtrack.geometry.meshes import Mesh, box_mesh
 
@@ -117,3 +121,26 @@ def test_tables_name_every_room_and_method() -> None:
     assert tables["Table 1: PQ, SQ, RQ, mAP@0.5 by room"][1][0][0] == "rooms:7"
     assert all(len(row) == len(columns) for columns, rows in tables.values() for row in rows)
     assert ordering(done, "full", "voxbloxpp") == (1, 1)
+
+
+def test_files_tell_what_segmented_the_images_and_whose_poses_they_are(tmp_path: Path) -> None:
+    task = RoomMapTask(7, False, ("full",), 1.0, 10, 0.02)
+    assert task.variant == ""
+    assert replace(task, strength=0.0).variant == "_strength-0"
+    assert replace(task, segmenter="learned", poses="estimated").variant == "_learned_estimated"
+    assert replace(task, segmenter="nets/mine.onnx").variant == "_nets-mine-onnx"
+    files = {replace(task, segmenter=name).file for name in ("oracle", "learned", "nets/mine.onnx")}
+    assert len(files) == 3
+    done = {replace(task, segmenter="learned"): {"full": scores(3)}}
+    assert write_panoptic(done, tmp_path) == ["panoptic_learned.json", "panoptic_learned.txt"]
+    assert "segmenter learned" in (tmp_path / "panoptic_learned.txt").read_text(encoding="utf-8")
+
+
+def test_results_of_another_network_are_not_carried_on(tmp_path: Path) -> None:
+    network = tmp_path / "segments.onnx"
+    network.write_bytes(b"one")
+    task = RoomMapTask(7, False, ("full",), 1.0, 10, 0.02, segmenter=str(tmp_path))
+    before = task.code()
+    network.write_bytes(b"another")
+    assert task.code() != before
+    assert replace(task, segmenter="oracle").code() not in (before, task.code())

@@ -58,10 +58,10 @@ class ShortlistConfig:
     """Share of the best upright candidate's error below which a tipped one goes before it: things stand as they are
     made to."""
     blocked_front: float = 1.5
-    """Factor on the error of a candidate whose front faces a wall, if it is articulated or one of `FACING_THE_ROOM`:
-    nobody could open it, or look at it."""
+    """Factor on the error of a candidate whose front faces a wall, if it is articulated or one of `FACING_THE_ROOM`, or
+    another articulated one, if it is articulated: nobody could open it, or look at it."""
     access: float = 0.3
-    """Metres that the front of what is articulated needs to a wall."""
+    """Metres that the front of what is articulated needs to a wall or to other furniture."""
     unseen_front: float = 0.3
     """Factor, added to 1, on the error of an articulated candidate whose front nobody saw where its rear was seen:
     rears stand against walls."""
@@ -77,16 +77,8 @@ class ShortlistConfig:
     box is not that of the carcass: something stands open."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "upright",
-            "tipped",
-            "turned",
-            "opened",
-            "access",
-            "unseen_front",
-            "rear_off_wall",
-            "natural_size",
-        ):
+        factors = ("access", "unseen_front", "rear_off_wall", "natural_size")
+        for name in ("upright", "tipped", "turned", "opened", *factors):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InvalidValueError(f"ShortlistConfig.{name}", getattr(self, name), "0 or more")
         if not 0.0 < self.advantage <= 1.0 or not 1.0 <= self.blocked_front < np.inf:

@@ -18,6 +18,15 @@ from simtrack.perception.segmentation.panoptic_network import (
 )
 
 FILE = "segments.onnx"
+SHIPPED = Path(__file__).resolve().parent / "weights" / FILE
+"""Trained by `simtrack train segmenter`; see docs/mapping.md. Licence: that of simtrack."""
+
+
+def network_file(path: Path | None) -> Path:
+    """The file of a network: in a folder, itself, or the one that comes along if None."""
+    if path is None:
+        return SHIPPED
+    return path / FILE if path.is_dir() else path
 
 
 class LearnedSegmenter:
@@ -26,13 +35,15 @@ class LearnedSegmenter:
     The classes are those of the training's rooms.
     """
 
-    def __init__(self, path: Path, config: DecodingConfig | None = None, runtime: Runtime = "auto") -> None:
-        """Open a network: the file, or the folder that `simtrack train segmenter` wrote.
+    def __init__(
+        self, path: Path | None = None, config: DecodingConfig | None = None, runtime: Runtime = "auto"
+    ) -> None:
+        """Open a network: the file, the folder that `simtrack train segmenter` wrote, or the one that comes along.
 
         Raises:
             FileFormatError: there is none, or it is another's.
         """
-        file = path / FILE if path.is_dir() else path
+        file = network_file(path)
         self._network = open_network(file, runtime)
         about = self._network.about()
         self._network.expect(("shown",), ("classes", "heat", "offsets"))

@@ -6,7 +6,9 @@ from typing import cast
 from simtrack.errors import StageError
 from simtrack.perception.segmentation.panoptic import Segmenter
 
-ALLOWED = "a folder or .onnx file of `simtrack train segmenter`, http://HOST:PORT, package.module:Class"
+LEARNED = "learned"
+"""The network that comes along."""
+ALLOWED = f"{LEARNED}, a folder or .onnx file of `simtrack train segmenter`, http://HOST:PORT, package.module:Class"
 
 
 def make_segmenter(given: str) -> Segmenter:
@@ -23,10 +25,10 @@ def make_segmenter(given: str) -> Segmenter:
         from simtrack.perception.segmentation.client import HttpSegmenter
 
         return HttpSegmenter(given)
-    if given.endswith(".onnx") or Path(given).is_dir():
+    if given == LEARNED or given.endswith(".onnx") or Path(given).is_dir():
         from simtrack.perception.segmentation.learned import LearnedSegmenter
 
-        return LearnedSegmenter(Path(given))
+        return LearnedSegmenter(None if given == LEARNED else Path(given))
     from simtrack.perception.foreign.loading import build_stage
 
     if ":" not in given:
