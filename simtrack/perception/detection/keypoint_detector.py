@@ -54,7 +54,7 @@ class KeypointDetectorConfig:
     """Seconds of simulated or recorded time from the image's stamp to the answer. The next image is taken then."""
     box_score: float = 0.4
     """Boxes with a lower score are not looked at."""
-    present: float = 0.9
+    present: float = 0.95
     """Windows in which the object is with less probability than this are dropped."""
     max_sigma: float = 0.3
     """Keypoints that are less certain than this, in shares of the window's side, are left out (NaN)."""
