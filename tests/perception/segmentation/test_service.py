@@ -119,7 +119,7 @@ def test_nobody_and_somebody_else_are_told_at_the_start() -> None:
     for wrong in ("https://localhost:1", "http://", "http://localhost:99999", "http://localhost:1/there"):
         with pytest.raises(InvalidValueError, match="http://HOST:PORT"):
             HttpSegmenter(wrong)
-    with pytest.raises(StageError, match="allowed: a folder"):
+    with pytest.raises(StageError, match="allowed: learned, a folder"):
         make_segmenter("mine")
     with served(ByColour()) as server, pytest.raises(StageError, match="cannot listen"):
         SegmenterServer(ByColour(), "second", port=server.server_address[1])
