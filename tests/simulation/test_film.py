@@ -91,5 +91,5 @@ def test_values_that_are_none_are_refused() -> None:
         OracleSegmenter(lambda stamp: np.zeros((1, 1), np.int32), (), strength=-1.0)
     with pytest.raises(InvalidValueError, match="furnished room"):
         map_source("workbench")
-    with pytest.raises(InvalidValueError, match="oracle, none, a folder"):
+    with pytest.raises(InvalidValueError, match="oracle, none, learned, a folder"):
         map_source("rooms:1", segmenter="mask2former")
