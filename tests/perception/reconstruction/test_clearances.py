@@ -33,7 +33,7 @@ def directions(graph: ContactGraph, name: str) -> list[str]:
     """The sides of a box by compass, as `SIDES` are sorted."""
     R = graph.nodes[name].box.T_map_box[:2, :2]
     compass = {(1, 0): "east", (0, 1): "north", (-1, 0): "west", (0, -1): "south"}
-    return [compass[tuple(round(float(c)) for c in R @ side)] for side in SIDES]
+    return [compass[round(float(x)), round(float(y))] for x, y in SIDES @ R.T]
 
 
 def test_walls_and_furniture_before_the_sides_are_measured() -> None:
