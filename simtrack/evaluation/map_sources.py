@@ -180,15 +180,14 @@ def map_source(
         raise InvalidValueError("source", source, "a furnished room such as rooms:7, or a folder of RGB-D images")
     number = scene.static.seed if scene.static.seed is not None else seed
     kind = kind_of(scene.static.config)
-    if segmenter not in (None, ORACLE):
-        _segmenter(segmenter)  # refuses bad values before a room is built
+    chosen = opened_segmenter(segmenter or ORACLE)  # before a room is built
     made = room_source(number, kind, film, strength, seed, f"{scene.name}-{number}")
-    return with_poses(with_segmenter(made, segmenter or ORACLE), poses, seed)
+    return with_poses(made if chosen is None else replace(made, segmenter=chosen), poses, seed)
 
 
-def with_segmenter(source: MapSource, segmenter: str) -> MapSource:
-    """A source that is segmented by another one than its own, the oracle; see `map_source`."""
-    return source if segmenter == ORACLE else replace(source, segmenter=_segmenter(segmenter))
+def opened_segmenter(given: str) -> Segmenter | None:
+    """The segmenter that is named as for `map_source`; None for the oracle, which belongs to a room."""
+    return None if given == ORACLE else _segmenter(given)
 
 
 def _segmenter(given: str) -> Segmenter:

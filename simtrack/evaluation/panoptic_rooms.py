@@ -8,14 +8,14 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from simtrack.errors import InvalidValueError, SimtrackError
-from simtrack.evaluation.map_sources import ORACLE, Poses, room_source, with_poses, with_segmenter
+from simtrack.evaluation.map_sources import ORACLE, Poses, opened_segmenter, room_source, with_poses
 from simtrack.evaluation.mapping import MapScores, class_means, map_scenes, score_map, score_metrics
 from simtrack.evaluation.metrics import write_atomically
 from simtrack.evaluation.panoptic import PAPER_CLASSES, STUFF, PanopticCount, ScoredClass, mean_precision
@@ -74,7 +74,8 @@ class RoomMapTask:
         """Map and compare; the contact graph is built of the full method's map alone."""
         film = FilmConfig(frames=self.frames, sensor=self.sensor)
         room = room_source(self.seed, "kitchen" if self.kitchen else None, film, self.strength)
-        source = with_poses(with_segmenter(room, self.segmenter), self.poses)
+        chosen = opened_segmenter(self.segmenter)
+        source = with_poses(room if chosen is None else replace(room, segmenter=chosen), self.poses)
         configs = [PanopticMapConfig.of_method(method, self.voxel) for method in self.methods]
         mapped = map_scenes(source, configs, progress)
         scores = {}
@@ -279,8 +280,8 @@ def write_panoptic(done: Mapping[RoomMapTask, Results], folder: Path) -> list[st
         "rooms": [{"room": t.room, "scores": {m: scores_to_json(s) for m, s in r.items()}} for t, r in done.items()],
     }
     write_atomically(folder / names[0], json.dumps(document) + "\n")
-    lines = [f"{len(done)} rooms, {first.frames} frames each ({first.sensor}), voxels of {1e3 * first.voxel:g} mm, "
-             f"{_told_of(first)}", ""]  # fmt: skip
+    filmed = f"{len(done)} rooms, {first.frames} frames each ({first.sensor}), voxels of {1e3 * first.voxel:g} mm"
+    lines = [f"{filmed}, {_told_of(first)}", ""]
     for title, (columns, rows) in tables_of(done, total).items():
         wide = [max(len(row[k]) for row in (columns, *rows)) for k in range(len(columns))]
         lines += [
