@@ -3,12 +3,15 @@
 Perturbations are decoupled and on the left: ``t' = t + rho``, ``R' = Exp(phi) @ R`` with ``xi = (rho, phi)``.
 """
 
+from math import atan2, cos, sin, sqrt
+
 import numpy as np
 
 from simtrack.contracts import Float64
 
 _IDENTITY = np.eye(4)  # a copy of it costs a fraction of np.eye
 _IDENTITY_3 = np.eye(3)
+_IDENTITY_6 = np.eye(6)
 
 
 def skew(vector: Float64) -> Float64:
@@ -19,41 +22,47 @@ def skew(vector: Float64) -> Float64:
 
 def exp_so3(rotation_vector: Float64) -> Float64:
     """(3, 3) rotation matrix of a (3,) rotation vector in radians (Rodrigues' formula)."""
-    phi = np.asarray(rotation_vector, dtype=float)
-    angle = float(np.sqrt(phi @ phi))
-    K = skew(phi)
+    x, y, z = np.asarray(rotation_vector, dtype=float).tolist()  # plain numbers: several times faster than small arrays
+    square = x * x + y * y + z * z
+    angle = sqrt(square)
     if angle < 1e-8:
-        return _IDENTITY_3 + K + 0.5 * K @ K
-    return _IDENTITY_3 + (np.sin(angle) / angle) * K + ((1.0 - np.cos(angle)) / angle**2) * K @ K
+        a, b = 1.0, 0.5
+    else:
+        a, b = sin(angle) / angle, (1.0 - cos(angle)) / square
+    xx, yy, zz, xy, xz, yz = b * x * x, b * y * y, b * z * z, b * x * y, b * x * z, b * y * z
+    x, y, z = a * x, a * y, a * z
+    return np.array([[1.0 - yy - zz, xy - z, xz + y], [xy + z, 1.0 - xx - zz, yz - x], [xz - y, yz + x, 1.0 - xx - yy]])
 
 
 def log_so3(rotation: Float64) -> Float64:
     """(3,) rotation vector, radians, norm in [0, pi], of a (3, 3) rotation matrix."""
-    wxyz = quaternion_from_rotation(rotation)
-    vector = wxyz[1:]
-    norm = float(np.sqrt(vector @ vector))
-    if norm < 1e-12:
-        return 2.0 * vector
-    return 2.0 * np.arctan2(norm, wxyz[0]) / norm * vector
+    w, x, y, z = _quaternion(np.asarray(rotation, dtype=float).tolist())
+    norm = sqrt(x * x + y * y + z * z)
+    scale = 2.0 if norm < 1e-12 else 2.0 * atan2(norm, w) / norm
+    return np.array([scale * x, scale * y, scale * z])
 
 
 def quaternion_from_rotation(rotation: Float64) -> Float64:
     """(4,) unit quaternion wxyz with w >= 0 of a (3, 3) rotation matrix (Shepperd's method)."""
-    m = np.asarray(rotation, dtype=float).tolist()  # plain numbers are several times faster than elements of arrays
-    trace = m[0][0] + m[1][1] + m[2][2]
-    largest = max(trace, m[0][0], m[1][1], m[2][2])
+    return np.array(_quaternion(np.asarray(rotation, dtype=float).tolist()))
+
+
+def _quaternion(m: list[list[float]]) -> tuple[float, float, float, float]:
+    (a, b, c), (d, e, f), (g, h, i) = m
+    trace = a + e + i
+    largest = max(trace, a, e, i)
     if trace == largest:
-        wxyz = np.array([1.0 + trace, m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]])
+        w, x, y, z = 1.0 + trace, h - f, c - g, d - b
+    elif a == largest:
+        w, x, y, z = h - f, 1.0 + a - e - i, d + b, g + c
+    elif e == largest:
+        w, x, y, z = c - g, d + b, 1.0 + e - i - a, h + f
     else:
-        i = 0 if m[0][0] == largest else 1 if m[1][1] == largest else 2
-        j, k = (i + 1) % 3, (i + 2) % 3
-        wxyz = np.empty(4)
-        wxyz[0] = m[k][j] - m[j][k]
-        wxyz[1 + i] = 1.0 + m[i][i] - m[j][j] - m[k][k]
-        wxyz[1 + j] = m[j][i] + m[i][j]
-        wxyz[1 + k] = m[k][i] + m[i][k]
-    wxyz /= np.sqrt(wxyz @ wxyz)
-    return -wxyz if wxyz[0] < 0.0 else wxyz
+        w, x, y, z = d - b, g + c, h + f, 1.0 + i - a - e
+    norm = sqrt(w * w + x * x + y * y + z * z)
+    if w < 0.0:
+        norm = -norm
+    return w / norm, x / norm, y / norm, z / norm
 
 
 def rotation_from_quaternion(wxyz: Float64) -> Float64:
@@ -116,8 +125,9 @@ def yaw_of(T: Float64) -> float:
 def inverse(T: Float64) -> Float64:
     """(4, 4) inverse of a rigid transform."""
     out = _IDENTITY.copy()
-    out[:3, :3] = T[:3, :3].T
-    out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    R_inverse = T[:3, :3].T
+    out[:3, :3] = R_inverse
+    out[:3, 3] = -(R_inverse @ T[:3, 3])
     return out
 
 
@@ -146,8 +156,8 @@ def orthonormal(rotation: Float64) -> Float64:
 
 def angle_between(R_a: Float64, R_b: Float64) -> float:
     """Angle of the rotation from one (3, 3) rotation to the other, radians in [0, pi]."""
-    vector = log_so3(R_a @ R_b.T)
-    return float(np.sqrt(vector @ vector))
+    w, x, y, z = _quaternion((R_a @ R_b.T).tolist())
+    return 2.0 * atan2(sqrt(x * x + y * y + z * z), w)
 
 
 def interpolate(T_a: Float64, T_b: Float64, fraction: float) -> Float64:
@@ -158,20 +168,17 @@ def interpolate(T_a: Float64, T_b: Float64, fraction: float) -> Float64:
 
 def with_lever(covariance: Float64, lever: Float64) -> Float64:
     """(6, 6) covariance of a left perturbation, of a body that is carried along at the end of a lever (3,), metres."""
-    S = skew(lever)
-    out = covariance.copy()
-    out[:3] -= S @ covariance[3:]
-    out[:, :3] -= out[:, 3:] @ S.T
-    return out
+    x, y, z = lever.tolist()
+    J = _IDENTITY_6.copy()
+    J[0, 4], J[0, 5], J[1, 3], J[1, 5], J[2, 3], J[2, 4] = z, -y, -z, x, y, -x
+    return J @ covariance @ J.T
 
 
 def rotate_covariance(rotation: Float64, covariance: Float64) -> Float64:
     """(6, 6) covariance of a left perturbation, expressed in the frame reached by a (3, 3) rotation."""
-    out = np.empty((6, 6))
-    for i in (0, 3):
-        for j in (0, 3):
-            out[i : i + 3, j : j + 3] = rotation @ covariance[i : i + 3, j : j + 3] @ rotation.T
-    return out
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = rotation
+    return turn @ covariance @ turn.T
 
 
 def look_at(eye: Float64, target: Float64, up: Float64 | None = None) -> Float64:
