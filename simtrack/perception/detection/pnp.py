@@ -13,7 +13,7 @@ import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Detection, Float64, PoseHypothesis
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import angle_between, exp_so3, transform
+from simtrack.geometry.transforms import angle_between, transform
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection import pnp_kernels as kernels
 
@@ -102,26 +102,15 @@ def _candidates(
     if first is None:
         return
     yield first
-    T = first[0]
     # Seen from afar, a box tilted towards the camera looks like one tilted away: start again from the reversed tilt.
-    view = T[:3, 3] / np.linalg.norm(T[:3, 3])
-    for axis in range(3):
-        normal = T[:3, axis]
-        tilt = np.cross(normal, view)
-        if (norm := float(np.linalg.norm(tilt))) > 1e-3:
-            angle = 2.0 * np.arctan2(norm, abs(float(normal @ view)))
-            sign = 1.0 if normal @ view > 0 else -1.0
-            start = transform(exp_so3(sign * angle * tilt / norm) @ T[:3, :3], T[:3, 3])
-            yield kernels.refine(start, points, pixels, camera)
+    poses, errors = kernels.tilted_back(first[0], points, pixels, camera)
+    yield from zip(poses, errors.tolist(), strict=True)
     # A detector confuses the corners of symmetric objects: give each keypoint the nearest equivalent corner.
+    mixed = np.empty_like(points)
     for symmetry in model.symmetries.discrete[1:]:
-        alternatives = np.stack([points, points @ symmetry[:3, :3].T + symmetry[:3, 3]])
         solution = first
         for _ in range(3):
-            projected = np.stack([project_points(solution[0], p, intrinsics) for p in alternatives])
-            distances = np.linalg.norm(projected - pixels, axis=2)
-            mixed = alternatives[np.argmin(distances, axis=0), np.arange(len(points))]
-            if not np.isfinite(distances).all() or len(np.unique(mixed.round(6), axis=0)) < 6:
+            if kernels.nearest_corners(solution[0], points, symmetry, pixels, camera, mixed) < 6:
                 break  # too few different corners left to be a box
             solution = _pnp(mixed, pixels, intrinsics, camera)
             if solution is None:
@@ -142,5 +131,4 @@ def _pnp(
         return None
     if not ok or not np.isfinite(rotation).all() or not np.isfinite(translation).all():
         return None
-    start = transform(exp_so3(rotation.astype(np.float64).ravel()), translation.astype(np.float64).ravel())
-    return kernels.refine(start, points, pixels, camera)
+    return kernels.refine(transform(cv2.Rodrigues(rotation)[0], translation.ravel()), points, pixels, camera)

@@ -104,6 +104,63 @@ def refine(T, points, pixels, camera):
 
 
 @njit(cache=True, nogil=True)
+def tilted_back(T, points, pixels, camera):
+    """Refined poses (H, 4, 4), H <= 3, and their squared errors (H,), from the reversed tilts of a pose.
+
+    Seen from afar, a box tilted towards the camera looks like one tilted away.
+    """
+    poses, errors, found = np.empty((3, 4, 4)), np.empty(3), 0
+    view = T[:3, 3] / np.sqrt((T[:3, 3] ** 2).sum())
+    start, tilt = T.copy(), np.empty(3)
+    for axis in range(3):
+        tilt[0] = T[1, axis] * view[2] - T[2, axis] * view[1]
+        tilt[1] = T[2, axis] * view[0] - T[0, axis] * view[2]
+        tilt[2] = T[0, axis] * view[1] - T[1, axis] * view[0]
+        norm = np.sqrt((tilt**2).sum())
+        if norm <= 1e-3:
+            continue
+        along = T[0, axis] * view[0] + T[1, axis] * view[1] + T[2, axis] * view[2]
+        angle = 2.0 * np.arctan2(norm, abs(along)) * (1.0 if along > 0.0 else -1.0)
+        start[:3, :3] = rotation(angle / norm * tilt) @ np.ascontiguousarray(T[:3, :3])
+        poses[found], errors[found] = refine(start, points, pixels, camera)
+        found += 1
+    return poses[:found], errors[:found]
+
+
+@njit(cache=True, nogil=True)
+def nearest_corners(T, points, symmetry, pixels, camera, mixed):
+    """Give each keypoint the point, or its equivalent by a (4, 4) symmetry, that is projected nearest to it: `mixed`.
+
+    Returns how many of them are different, 0 if a point lies behind the camera.
+    """
+    other = np.empty(3)
+    for k in range(points.shape[0]):
+        for i in range(3):
+            other[i] = symmetry[i, 3]
+            for j in range(3):
+                other[i] += symmetry[i, j] * points[k, j]
+        own, alternative = 0.0, 0.0
+        for choice in range(2):
+            p = points[k] if choice == 0 else other
+            z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+            if not z > 1e-6:
+                return 0
+            x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+            y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+            square = (camera[0] * x / z + camera[2] - pixels[k, 0]) ** 2
+            square += (camera[1] * y / z + camera[3] - pixels[k, 1]) ** 2
+            own, alternative = (square, 0.0) if choice == 0 else (own, square)
+        mixed[k] = points[k] if own <= alternative else other
+    different = 0
+    for k in range(mixed.shape[0]):
+        alike = False
+        for other_k in range(k):
+            alike |= (np.abs(mixed[k] - mixed[other_k]) < 1e-6).all()
+        different += not alike
+    return different
+
+
+@njit(cache=True, nogil=True)
 def covariance(T, points, sigmas, camera):
     """(6, 6) inverse Fisher information of keypoints with standard deviations `sigmas` (N,), pixels; camera frame."""
     H, g = np.empty((6, 6)), np.empty(6)
