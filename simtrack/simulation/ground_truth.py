@@ -6,14 +6,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from simtrack.contracts import NANOSECONDS, Bool, CameraIntrinsics, Float64, Int32
 from simtrack.errors import UnknownNameError
-from simtrack.geometry.transforms import apply, difference, inverse
+from simtrack.geometry.transforms import difference, inverse
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
 from simtrack.simulation.contacts import SUPPORTING, contact_pairs
 from simtrack.simulation.history import History
 from simtrack.simulation.placement import DEEP
+from simtrack.simulation.silhouettes import silhouette_rays
 from simtrack.simulation.world import SENSOR_BODIES, World, body_pose, body_poses
 from simtrack.simulation.world_rays import WorldRays
 
@@ -22,8 +24,6 @@ if TYPE_CHECKING:
 
 CONTACT_WINDOW = 20_000_000
 """Nanoseconds: contacts within it count, so that one that chatters for a physics step does not flicker."""
-SILHOUETTE_RAYS = 900
-"""About how many rays measure the visibility of one object."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +89,8 @@ class GroundTruth:
         }
         self._contacts = _ContactLog(world, history.key)
         self._alone: RayScene | None = None
+        self._corners = np.array([model.keypoints[:8] for model in world.objects.values()]).reshape(-1, 8, 3)
+        self._object_ids = np.array([world.names.index(name) for name in world.objects], np.int32)
         self._lidar: dict[int, Int32] = {}
         self._full: RayBundle | None = None
         self._seen: tuple[int, dict[str, Visibility]] | None = None
@@ -158,27 +160,24 @@ class GroundTruth:
         self._load(stamp)
         T_map_camera = body_pose(self._scratch, self._sensors["camera"])
         names, poses = self._object_poses()
-        owners, rays, area = self._silhouette_rays(T_map_camera, names, poses)
-        result = dict.fromkeys(names, Visibility(0, 0.0))
+        owners, rays, inside, area = silhouette_rays(self._corners, inverse(T_map_camera) @ poses, self._intrinsics)
         if not len(rays):
-            return result
-        directions = rays @ T_map_camera[:3, :3].T
+            return dict.fromkeys(names, Visibility(0, 0.0))
+        directions = rays @ T_map_camera[:3, :3].T.astype(np.float32)
         # Each object alone: they stand far apart from one another, and each ray starts in front of its own.
-        alone, offsets = self._objects_apart(names, poses)
+        alone, offsets = self._objects_apart(names, poses, np.flatnonzero(area))
         own = alone.cast_rays(T_map_camera[:3, 3] + offsets[owners], directions).instances == owners
-        owners, rays, directions = owners[own], rays[own], directions[own]
+        whole = np.bincount(owners[own], minlength=len(names)).tolist()
+        own &= inside
+        owners, directions = owners[own], directions[own]
         origins = np.broadcast_to(T_map_camera[:3, 3], directions.shape)
         hits = self._rays.scene.cast_rays(origins, directions, min_distance=0.03)
-        index = np.array([self.names.index(name) for name in names])
-        inside = self._in_image(rays)
-        seen = inside & (self._rays.ids(hits) == index[owners])
-        for k, name in enumerate(names):
-            mine = owners == k
-            whole = int(np.count_nonzero(mine))
-            if whole:
-                visible = int(np.count_nonzero(seen & mine))
-                result[name] = Visibility(round(visible * float(area[k])), visible / whole)
-        return result
+        seen = self._rays.ids(hits) == self._object_ids[owners]
+        visible = np.bincount(owners[seen], minlength=len(names)).tolist()
+        return {
+            name: Visibility(round(visible[k] * float(area[k])), visible[k] / max(whole[k], 1))
+            for k, name in enumerate(names)
+        }
 
     def ids(self, stamp: int) -> Int32:
         """(H, W), index into `names` of what each pixel of the camera sees, -1 = nothing."""
@@ -231,8 +230,10 @@ class GroundTruth:
         names = list(self._world.objects)
         return names, body_poses(self._scratch, [self._movable[name] for name in names])
 
-    def _objects_apart(self, names: list[str], poses: Float64) -> tuple[RayScene, Float64]:
-        """A scene in which object k is instance k, displaced by its row of the offsets (K, 3)."""
+    def _objects_apart(
+        self, names: list[str], poses: Float64, placed: npt.NDArray[np.int64]
+    ) -> tuple[RayScene, Float64]:
+        """A scene in which object k, of those that are `placed`, is instance k, displaced by row k of the offsets."""
         if self._alone is None:
             self._alone = RayScene()
             meshes: dict[int, TriangleMesh] = {}
@@ -243,40 +244,10 @@ class GroundTruth:
                 self._alone.add(meshes[id(mesh)], instance=k)
         offsets = np.zeros((len(names), 3))
         offsets[:, 2] = 200.0 * np.arange(len(names))
-        shifted = poses.copy()
-        shifted[:, :3, 3] += offsets
-        self._alone.set_poses(range(len(names)), shifted)
+        shifted = poses[placed]
+        shifted[:, :3, 3] += offsets[placed]
+        self._alone.set_poses(placed.tolist(), shifted)
         return self._alone, offsets
-
-    def _silhouette_rays(
-        self, T_map_camera: Float64, names: list[str], poses: Float64
-    ) -> tuple[np.ndarray, Float64, Float64]:
-        """Rays (camera frame, z = 1) over each object's projected box: owners (R,), rays (R, 3), pixels a ray (K,)."""
-        camera = self._intrinsics
-        owners, rays, area = [], [], np.zeros(len(names))
-        T_camera_map = inverse(T_map_camera)
-        for k, (name, T) in enumerate(zip(names, poses, strict=True)):
-            corners = apply(T_camera_map @ T, self._world.objects[name].keypoints)
-            if corners[:, 2].min() < 0.05:
-                continue
-            low = (corners[:, :2] / corners[:, 2:]).min(axis=0) * camera.fx
-            high = (corners[:, :2] / corners[:, 2:]).max(axis=0) * camera.fx
-            stride = max(1, int(np.sqrt(np.prod(high - low) / SILHOUETTE_RAYS)))
-            # On the pixel grid, so that a pixel counts as visible exactly if its ray is.
-            u = np.arange(np.floor(low[0] + camera.cx), np.ceil(high[0] + camera.cx) + 1, stride)
-            v = np.arange(np.floor(low[1] + camera.cy), np.ceil(high[1] + camera.cy) + 1, stride)
-            uu, vv = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
-            rays.append(np.stack([uu.ravel(), vv.ravel(), np.ones(uu.size)], axis=1))
-            owners.append(np.full(uu.size, k))
-            area[k] = stride**2
-        if not rays:
-            return np.zeros(0, np.int64), np.zeros((0, 3)), area
-        return np.concatenate(owners), np.concatenate(rays), area
-
-    def _in_image(self, rays: Float64) -> np.ndarray:
-        camera = self._intrinsics
-        u, v = rays[:, 0] * camera.fx + camera.cx, rays[:, 1] * camera.fy + camera.cy
-        return (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
 
     def close(self) -> None:
         """Release ray scenes."""

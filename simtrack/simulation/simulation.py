@@ -24,6 +24,7 @@ from simtrack.geometry.transforms import inverse, rotation_from_rpy, transform, 
 from simtrack.objects import ObjectModel, TrackerModelConfig, tracker_model
 from simtrack.perception.beside import AtOnce
 from simtrack.raycast import RayBundle
+from simtrack.raycast.sweep import sweep
 from simtrack.sensors.camera import XTION, CameraModel
 from simtrack.sensors.faults import CalibrationFaults, FaultyFeed, FeedFaults
 from simtrack.sensors.lidar import VLP16, LidarModel, LidarNoiseConfig, apply_lidar_noise, reflected_intensity
@@ -375,13 +376,10 @@ class Simulation:
             R = self._scan_scratch.xmat[self._lidar_body].reshape(3, 3)
             sensor[k] = transform(R, self._scan_scratch.xpos[self._lidar_body])
         self._rays.move(poses)
-        times = shots.times.astype(np.float64) * (NANOSECONDS / self.lidar.period)
-        index = np.minimum((times * (keys - 1)).astype(np.int64), keys - 2)
-        part = (times * (keys - 1) - index)[:, None, None]
-        T = (1.0 - part) * sensor[index, :3] + part * sensor[index + 1, :3]
-        directions = np.einsum("nij,nj->ni", T[:, :, :3], shots.directions)
+        times = shots.times * np.float32(NANOSECONDS / self.lidar.period)
+        origins, directions = sweep(shots.directions, times, 1.0 / (keys - 1), sensor)
         hits = self._rays.scene.cast_rays(
-            T[:, :, 3], directions, times, self.lidar.max_range, min_distance=0.06, packing=self._packing
+            origins, directions, times, self.lidar.max_range, min_distance=0.06, packing=self._packing
         )
         incidence = np.arccos(np.minimum(np.abs(np.einsum("ij,ij->i", hits.normals, directions)), 1.0))
         intensities = reflected_intensity(self._rays.albedos(hits), incidence)

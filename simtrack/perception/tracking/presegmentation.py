@@ -24,10 +24,10 @@ from simtrack.contracts import (
     Status,
 )
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import apply
 from simtrack.perception.tracking.correspondences import axial_variance, usable_depth
 from simtrack.raycast import RayBundle, RayScene
 from simtrack.raycast.kernels import run
+from simtrack.raycast.sweep import sweep
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +148,10 @@ def presegment_lidar(
     labels = np.zeros(len(unknown), np.int32)
     clusters, count = _cluster_points(points[stray], config.lidar_join, config.min_points)
     labels[open_[stray]] = clusters
+    members = [points[stray][clusters == k] for k in range(1, count + 1)]
     regions = tuple(
-        _region(scan.stamp, points[stray][clusters == k], np.zeros(4), "lidar") for k in range(1, count + 1)
+        _region(scan.stamp, cluster.min(axis=0), cluster.max(axis=0), np.zeros(4), len(cluster), "lidar")
+        for cluster in members
     )
     return Presegmentation(scan.stamp, unknown, valid, labels, regions, "lidar")
 
@@ -158,9 +160,7 @@ def shot_rays(scan: LidarScan, pose_at: Callable[[int], Float64]) -> tuple[Float
     """Origins and unit directions (N, 3) of a scan's shots in the map, each from the sensor's pose at its own time."""
     knots = _knots(scan)
     poses = np.stack([pose_at(stamp) @ scan.T_base_lidar for stamp in shot_stamps(scan)])
-    origins, directions = np.empty(scan.directions.shape, np.float32), np.empty(scan.directions.shape, np.float32)
-    _shoot(scan.directions, scan.times, knots[1], poses, origins, directions)
-    return origins, directions
+    return sweep(scan.directions, scan.times, knots[1], poses)
 
 
 def shot_stamps(scan: LidarScan) -> list[int]:
@@ -172,25 +172,6 @@ def _knots(scan: LidarScan) -> Float64:
     """Seconds after the scan's stamp between which its motion is taken to be even."""
     last = float(scan.times.max()) if len(scan.times) else 0.0
     return np.linspace(0.0, max(last, 1e-6), 5)
-
-
-@njit(cache=True, nogil=True)
-def _shoot(shots, times, period, poses, origins, directions):
-    """Shots (N, 3) from poses (K, 4, 4) at multiples of `period`, between which all is interpolated linearly."""
-    for i in range(shots.shape[0]):
-        position = min(max(float(times[i]) / period, 0.0), poses.shape[0] - 1.000001)
-        lower = int(position)
-        share = position - lower
-        length = 0.0
-        for a in range(3):
-            ahead = 0.0
-            for b in range(3):
-                ahead += ((1.0 - share) * poses[lower, a, b] + share * poses[lower + 1, a, b]) * shots[i, b]
-            directions[i, a] = ahead
-            length += ahead * ahead
-            origins[i, a] = (1.0 - share) * poses[lower, a, 3] + share * poses[lower + 1, a, 3]
-        for a in range(3):
-            directions[i, a] /= np.sqrt(length)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -348,20 +329,32 @@ def _grow(labels, doubtful, depth, join, steps):
 def _camera_regions(
     labels: Int32, count: int, depth: Float32, K: CameraIntrinsics, T_map_camera: Float64, stamp: int
 ) -> tuple[RegionOfInterest, ...]:
-    pixels = np.flatnonzero(labels.ravel() != 0)
-    rows, columns = np.divmod(pixels, labels.shape[1])
-    owner = labels.ravel()[pixels]
-    order = np.argsort(owner, kind="stable")
-    starts = np.searchsorted(owner[order], np.arange(1, count + 2))
-    regions = []
-    for k in range(count):
-        members = order[starts[k] : starts[k + 1]]
-        v, u = rows[members], columns[members]
-        d = depth[v, u].astype(float)
-        points = apply(T_map_camera, np.stack([d * (u - K.cx) / K.fx, d * (v - K.cy) / K.fy, d], axis=1))
-        box = np.array([u.min(), v.min(), u.max() + 1, v.max() + 1], float)
-        regions.append(_region(stamp, points, box, "camera"))
-    return tuple(regions)
+    boxes, bounds, sizes = np.zeros((count, 4)), np.empty((count, 2, 3)), np.zeros(count, np.int64)
+    _bound(labels, depth, np.array([K.fx, K.fy, K.cx, K.cy]), T_map_camera, boxes, bounds, sizes)
+    return tuple(
+        _region(stamp, low, high, box, size, "camera")
+        for (low, high), box, size in zip(bounds, boxes, sizes.tolist(), strict=True)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _bound(labels, depth, camera, T_map_camera, boxes, bounds, sizes):
+    """Pixel boxes (K, 4), bounds (K, 2, 3) in the map, metres, and sizes (K,) in pixels of clusters 1 to K."""
+    boxes[:, :2], boxes[:, 2:], bounds[:, 0], bounds[:, 1] = np.inf, 0.0, np.inf, -np.inf
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            k = labels[v, u] - 1
+            if k < 0:
+                continue
+            sizes[k] += 1
+            box = boxes[k]
+            box[0], box[1], box[2], box[3] = min(box[0], u), min(box[1], v), max(box[2], u + 1), max(box[3], v + 1)
+            d = float(depth[v, u])
+            x, y = d * (u - camera[2]) / camera[0], d * (v - camera[3]) / camera[1]
+            for i in range(3):
+                T = T_map_camera[i]
+                at = T[0] * x + T[1] * y + T[2] * d + T[3]
+                bounds[k, 0, i], bounds[k, 1, i] = min(bounds[k, 0, i], at), max(bounds[k, 1, i], at)
 
 
 def _cluster_points(points: Float64, distance: float, min_points: int) -> tuple[Int32, int]:
@@ -384,6 +377,5 @@ def _cluster_points(points: Float64, distance: float, min_points: int) -> tuple[
     return number[component], len(kept)
 
 
-def _region(stamp: int, points: Float64, box: Float64, sensor: str) -> RegionOfInterest:
-    low, high = points.min(axis=0), points.max(axis=0)
-    return RegionOfInterest(stamp, box, 0.5 * (low + high), high - low, len(points), sensor)
+def _region(stamp: int, low: Float64, high: Float64, box: Float64, size: int, sensor: str) -> RegionOfInterest:
+    return RegionOfInterest(stamp, box, 0.5 * (low + high), high - low, size, sensor)
