@@ -82,15 +82,20 @@ class RayBundle:
 
     @staticmethod
     def from_windows(
-        intrinsics: CameraIntrinsics, windows: Sequence[tuple[int, int, int, int]], strides: Sequence[int] | int = 1
+        intrinsics: CameraIntrinsics,
+        windows: Sequence[tuple[int, int, int, int]] | npt.NDArray[np.int64],
+        strides: Sequence[int] | npt.NDArray[np.int64] | int = 1,
     ) -> "RayBundle":
         """Rays of the union of windows (see `from_camera`), each with its stride; every pixel once, row-major."""
-        steps = [strides] * len(windows) if isinstance(strides, int) else list(strides)
-        if len(steps) != len(windows) or min(steps, default=1) < 1:
-            raise InvalidValueError("strides", strides, f"one number >= 1, or {len(windows)} of them")
-        boxes = np.array([_clip(window, intrinsics) for window in windows], np.int64).reshape(-1, 4)
-        pixels = _union(boxes, np.array(steps, np.int64), intrinsics.width)
-        return _from_pixels(intrinsics, pixels, 1, (len(pixels),))
+        boxes = np.array(windows, np.int64).reshape(-1, 4)
+        steps = np.full(len(boxes), strides, np.int64) if isinstance(strides, int) else np.array(strides, np.int64)
+        if len(steps) != len(boxes) or (len(steps) and steps.min() < 1):
+            raise InvalidValueError("strides", strides, f"one number >= 1, or {len(boxes)} of them")
+        camera = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+        size, tables = (intrinsics.width, intrinsics.height), _camera_tables(intrinsics, 1)
+        fields = _window_bundle(boxes, steps, *size, *tables, *camera, packet_width())
+        pixels, directions, order, packed, cones = fields
+        return RayBundle(directions, order, packed, pixels, (len(pixels),), cones)
 
     @staticmethod
     def from_directions(directions: npt.ArrayLike, groups: npt.ArrayLike | None = None) -> "RayBundle":
@@ -321,3 +326,14 @@ def _pack_pixels(pixels, image_width, columns, rows, fx, fy, cx, cy, width):
             for axis in range(3):
                 packed[p, axis, k] = directions[i, axis]
     return directions, order, packed
+
+
+@nb.njit(cache=True, nogil=True)
+def _window_bundle(boxes, steps, image_width, image_height, columns, rows, fx, fy, cx, cy, width):
+    """Pixels, directions, order, directions in that order, and cones of windows; `boxes` are clipped to the image."""
+    for k in range(boxes.shape[0]):
+        boxes[k, 0], boxes[k, 1] = max(boxes[k, 0], 0), max(boxes[k, 1], 0)
+        boxes[k, 2], boxes[k, 3] = min(boxes[k, 2], image_width), min(boxes[k, 3], image_height)
+    pixels = _union(boxes, steps, image_width)
+    directions, order, packed = _pack_pixels(pixels, image_width, columns, rows, fx, fy, cx, cy, width)
+    return pixels, directions, order, packed, _pixel_cones(packed)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64
 from simtrack.perception.tracking import correspondences as kernels
 from simtrack.perception.tracking import solver
+from simtrack.perception.tracking.iteration import NO_SILHOUETTES, iterate
 from simtrack.perception.tracking.registration_config import RegistrationConfig, Step
 from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
 
@@ -233,7 +234,7 @@ class Registration:
         if marked:
             bundle = RayBundle.from_pixels(batch.intrinsics, kernels.take_marked(self._marks, *batch.depth.shape))
         else:
-            bundle = RayBundle.from_windows(batch.intrinsics, windows.tolist(), grids.tolist())
+            bundle = RayBundle.from_windows(batch.intrinsics, windows, grids)
         # Rays a few pixels apart meet other triangles of a fine mesh: they are no coherent packets.
         hits = self._scene.cast(bundle, np.eye(4), coherent=None if (grids == 1).all() else False)
         if len(bundle) > len(self._points.weight):
@@ -242,34 +243,20 @@ class Registration:
 
     def _iterate(self, batch: "_Batch", step: Step, iterations: int) -> None:
         """One outer iteration of the active instances: a cast, its correspondences, and solver steps on them."""
-        config, count = self.config, len(batch.instances)
+        config = self.config
         batch.locate()
         strides = batch.fine_strides if step.fine else step.coarsen * batch.strides
         bundle, hits = self._cast(batch, strides, marked=step.fine)
-        pixels = bundle.pixels
-        assert pixels is not None
-        # Occluders that are not registered keep their rays: they are neither misses nor rows.
-        row = np.full(max(self._models) + 1, count, np.int32)
-        row[batch.instances] = np.where(batch.active, np.arange(count), count)
-        rows = np.empty(len(bundle), np.int32)
-        kernels.rows_of(hits.instances, row, rows)
-        if not step.fine:
-            kernels.mark_around(pixels, rows, batch.depth.shape[1], strides, batch.fine_strides, self._marks)
-        batch.counts[batch.active], batch.edges[batch.active] = 0, 0
-        pairs = kernels.point_correspondences(
-            pixels, bundle.directions, hits.distances, hits.normals, rows, batch.depth.reshape(-1),
-            batch.depth.shape[1], strides, step.gate, 0.0, config.model_sigma, config.focal_baseline,
-            0.4 / batch.camera[0], np.zeros(3), self._points, 0, batch.counts,
+        reach = step.edge_reach if step.silhouettes != "never" else NO_SILHOUETTES
+        iterate(
+            bundle.pixels, bundle.directions, hits.distances, hits.normals, hits.instances, batch.depth, *self._images,
+            self._marks, *self._points, *self._edges, batch.ids, batch.active, strides, batch.fine_strides,
+            batch.radii, batch.camera, batch.poses, batch.counts, batch.edges, batch.used, batch.covariance,
+            batch.constrained, batch.stats, batch.moved, batch.deviations, step.fine, step.gate, config.model_sigma,
+            config.focal_baseline, reach, config.edge_step, config.correlation_area, config.edge_correlation,
+            _EDGES[step.silhouettes], step.kernel, config.edge_kernel, config.edge_sigma, config.unconstrained_sigma,
+            config.max_shift, config.max_turn, config.last_step, iterations, config.solver == "umeyama",
         )  # fmt: skip
-        edge_pairs = 0
-        if step.silhouettes != "never":
-            kernels.draw(pixels, hits.distances, rows, self._images)
-            edge_pairs = kernels.edge_correspondences(
-                pixels, rows, batch.depth, self._images, batch.camera, strides, step.edge_reach, config.edge_step,
-                config.focal_baseline, self._edges, batch.edges,
-            )  # fmt: skip
-            kernels.erase(pixels, self._images)
-        batch.solve(self._points, pairs, self._edges, edge_pairs, strides, step, config, iterations)
         if iterations:
             moved = np.flatnonzero(batch.active)
             self._scene.set_poses([batch.instances[k] for k in moved], batch.poses[moved])
@@ -307,10 +294,10 @@ class _Batch:
         self.stats = np.zeros((count, 3))
 
     def _take(self, models: Mapping[int, TrackedModel], poses: Mapping[int, Float64], instances: list[int]) -> None:
-        self.instances = instances
+        self.instances, self.ids = instances, np.array(instances, np.int64)
         self.poses = np.array([poses[i] for i in instances]).reshape(-1, 4, 4)
         self._corners = np.array([models[i].corners for i in instances]).reshape(-1, 8, 3)
-        self._radii = np.array([models[i].radius for i in instances])
+        self.radii = np.array([models[i].radius for i in instances])
         self.windows = np.zeros((len(instances), 4), np.int64)
         self.locate()
 
@@ -326,43 +313,8 @@ class _Batch:
         misfit = self.stats[:, 1] / np.maximum(self.stats[:, 0], 1e-9)
         shift = np.linalg.norm(self.poses[:, :3, 3] - predicted[:, :3, 3], axis=1)
         trace = np.einsum("kij,kij->k", self.poses[:, :3, :3], predicted[:, :3, :3])
-        moved = shift + np.sqrt(np.maximum(3.0 - trace, 0.0)) * self._radii
+        moved = shift + np.sqrt(np.maximum(3.0 - trace, 0.0)) * self.radii
         return (support >= config.near_support) & (misfit <= config.near_misfit) & (moved <= config.near_move)
-
-    def solve(
-        self,
-        points: kernels.Points,
-        pairs: int,
-        edges: kernels.Edges,
-        edge_pairs: int,
-        strides: npt.NDArray[np.int64],
-        step: Step,
-        config: RegistrationConfig,
-        iterations: int,
-    ) -> None:
-        """Move the active instances by solver steps on fixed correspondences (0: only judge the present poses)."""
-        count = len(self.instances)
-        centres, shifts = self.poses[:, :3, 3].copy(), np.zeros((count, 3))
-        rotations = np.zeros((count, 3, 3))
-        rotations[:, [0, 1, 2], [0, 1, 2]] = 1.0
-        self.used[self.active] = strides[self.active]
-        steps = iterations
-        if config.solver == "umeyama":
-            solver.umeyama(points, pairs, centres, rotations, shifts, iterations)
-            steps = 0
-        shares = np.column_stack([config.correlation_area / strides**2, config.edge_correlation / strides])
-        settings = solver.SolverSettings(
-            step.kernel, config.edge_kernel, _EDGES[step.silhouettes], config.edge_sigma, config.unconstrained_sigma,
-            config.max_shift, config.max_turn, config.last_step,
-        )  # fmt: skip
-        solver.gauss_newton(
-            points, pairs, edges, edge_pairs, self.camera, centres, rotations, shifts, self._radii,
-            np.maximum(1.0, shares), self.active, settings, steps, self.covariance, self.constrained, self.stats,
-        )  # fmt: skip
-        if iterations:
-            solver.advance(
-                self.poses, rotations, shifts, self._radii, self.covariance, self.active, self.moved, self.deviations
-            )
 
     def results(self, config: RegistrationConfig) -> dict[int, RegistrationResult]:
         """Results of every instance at its present pose."""

@@ -141,7 +141,7 @@ def rotation(phi):
     return np.eye(3) + (np.sin(angle) / angle) * K + ((1.0 - np.cos(angle)) / angle**2) * K @ K
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, forceinline=True)
 def gauss_newton(
     points, pairs, edges, edge_pairs, camera, centres, rotations, shifts, radii, correlation, active, settings,
     iterations, covariance, constrained, stats,
