@@ -3,7 +3,7 @@
 Perturbations are decoupled and on the left: ``t' = t + rho``, ``R' = Exp(phi) @ R`` with ``xi = (rho, phi)``.
 """
 
-from math import atan2, cos, sin, sqrt
+from math import atan2, cos, isfinite, sin, sqrt
 
 import numpy as np
 
@@ -194,10 +194,13 @@ def look_at(eye: Float64, target: Float64, up: Float64 | None = None) -> Float64
 
 def is_rigid(T: np.ndarray, tolerance: float = 1e-6) -> bool:
     """Whether a (4, 4) matrix is a finite proper rigid transform."""
-    return bool(
-        T.shape == (4, 4)
-        and np.isfinite(T).all()
-        and np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < tolerance
-        and np.linalg.det(T[:3, :3]) > 0
-        and np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0])
-    )
+    if T.shape != (4, 4):
+        return False
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = np.asarray(T, dtype=float).tolist()
+    errors = (
+        a * a + b * b + c * c - 1.0, d * d + e * e + f * f - 1.0, g * g + h * h + i * i - 1.0,
+        a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i,
+    )  # fmt: skip
+    proper = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
+    orthogonal = all(abs(error) < tolerance for error in errors)  # False where one is NaN
+    return orthogonal and proper and isfinite(x + y + z) and last == [0.0, 0.0, 0.0, 1.0]

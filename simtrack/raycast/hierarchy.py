@@ -72,8 +72,7 @@ class Hierarchy:
 
     def move(self, numbers: npt.NDArray[np.int64]) -> None:
         """Tell of new poses of instances at rest."""
-        held = numbers[self._table.handles[numbers] != 0]
-        instancing.move(self._table.handles[held], instancing.columns(self._table.poses[held]))
+        instancing.move(self._table.handles, numbers, self._table.poses)
 
     def set_off(self, numbers: npt.NDArray[np.int64], keys: Float64) -> None:
         """Tell of the motion of instances (N,) through as many keys (N, K, 4, 4) each."""

@@ -41,12 +41,18 @@ def place(device, top, meshes, numbers, transforms, geometries):
 
 
 @njit(cache=True, nogil=True)
-def move(geometries, transforms):
-    """Set instances (N,) at rest to `transforms` (N, 12)."""
-    for k in range(geometries.shape[0]):
-        _rtcSetGeometryTimeStepCount(geometries[k], np.uint32(1))
-        _rtcSetGeometryTransform(geometries[k], np.uint32(0), _COLUMNS, transforms.ctypes.data + 48 * k)
-        _rtcCommitGeometry(geometries[k])
+def move(geometries, numbers, poses):
+    """Set the instances `numbers` (N,) to rest at their `poses`, where they have a geometry (see `InstanceTable`)."""
+    columns = np.empty(12, np.float32)
+    for number in numbers:
+        if geometries[number] == 0:
+            continue
+        for j in range(4):
+            for i in range(3):
+                columns[3 * j + i] = poses[number, i, j]
+        _rtcSetGeometryTimeStepCount(geometries[number], np.uint32(1))
+        _rtcSetGeometryTransform(geometries[number], np.uint32(0), _COLUMNS, columns.ctypes.data)
+        _rtcCommitGeometry(geometries[number])
 
 
 @njit(cache=True, nogil=True)

@@ -144,9 +144,9 @@ class Evidence:
         intrinsics: CameraIntrinsics,
         config: PoseSearchConfig,
     ) -> "Evidence | None":
-        """None where there is too little to go by: no depth in the box, or a box that is no witness of its own."""
+        """None where there is too little to go by: no depth in the box."""
         K, box = intrinsics, np.asarray(detection.box, float)
-        if not np.isfinite(box).all() or _drawn_about(detection.keypoints, box):
+        if not np.isfinite(box).all():
             return None
         size, sides = np.array([K.width, K.height], float), box[2:] - box[:2]
         inner, window = (_pixels(box, by * sides, size) for by in (-0.25, config.margin))
@@ -221,9 +221,10 @@ def _solution(rays: Float64, sigma: Float64, distance_sigma: float) -> Float64:
     return np.asarray(np.linalg.pinv(A * weights[:, None]) * weights, np.float64)
 
 
-def _drawn_about(keypoints: Float64, box: Float64) -> bool:
-    """Whether a box is only that of the keypoints, and tells nothing more than they do."""
+def drawn_about(keypoints: Float64, box: Float64) -> bool:
+    """Whether a box (4,) is only that of the keypoints (N, 2), pixels, and tells nothing more than they do."""
     known = keypoints[np.isfinite(keypoints).all(axis=1)]
     if not len(known):
         return False
-    return bool(np.allclose(box, np.concatenate([known.min(axis=0), known.max(axis=0)])))
+    own = np.concatenate([known.min(axis=0), known.max(axis=0)])
+    return bool((np.abs(box - own) <= 1e-5 * np.abs(own) + 1e-8).all())

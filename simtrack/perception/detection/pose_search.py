@@ -16,7 +16,14 @@ from simtrack.geometry.transforms import transform
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection import pnp_kernels
 from simtrack.perception.detection import search_kernels as kernels
-from simtrack.perception.detection.evidence import Evidence, PoseSearchConfig, RayGrid, ShownModel, rotation_grid
+from simtrack.perception.detection.evidence import (
+    Evidence,
+    PoseSearchConfig,
+    RayGrid,
+    ShownModel,
+    drawn_about,
+    rotation_grid,
+)
 from simtrack.perception.detection.pnp import PnpConfig
 from simtrack.perception.tracking import correspondences, solver
 from simtrack.perception.tracking.registration_config import RegistrationConfig
@@ -63,6 +70,8 @@ class PoseSearch:
             Empty where no pose agrees with the measured depth: the detection is wrong. None where nothing can be said:
             there is no depth in the box, or the box is only that of the keypoints.
         """
+        if drawn_about(detection.keypoints, np.asarray(detection.box, float)):
+            return None
         shown = self.shown(detection.class_name)
         evidence = Evidence.of(detection, shown, depth, intrinsics, self.config)
         if evidence is None:
