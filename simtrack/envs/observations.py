@@ -179,6 +179,8 @@ class Encoder:
         kept = self._assign(belief.tracks)
         for slot, track in kept:
             self._write(out, slot, track, belief.stamp)
+        for key, limit in (("position", PLACE), ("velocity", SPEED), ("covariance", VARIANCE)):
+            np.clip(out[key], -limit, limit, out=out[key])
         self._relate(out, belief, kept)
         self._articulate(out, belief)
         self._look(out, belief)
@@ -207,10 +209,10 @@ class Encoder:
         out["mask"][slot] = 1
         out["id"][slot] = track.id
         out["class"][slot, self._class[track.class_name]] = 1
-        out["position"][slot] = np.clip(track.T_map_object[:3, 3], -PLACE, PLACE)
+        out["position"][slot] = track.T_map_object[:3, 3]
         out["rotation"][slot] = quaternion_from_rotation(track.T_map_object[:3, :3])
-        out["velocity"][slot] = np.clip(track.velocity, -SPEED, SPEED)
-        out["covariance"][slot] = np.clip(track.covariance, -VARIANCE, VARIANCE)
+        out["velocity"][slot] = track.velocity
+        out["covariance"][slot] = track.covariance
         out["status"][slot, self._status[track.status]] = 1
         out["age"][slot] = min(max(stamp - track.last_seen, 0) / NANOSECONDS, AGE)
         out["visible"][slot] = min(max(track.visible_fraction, 0.0), 1.0)

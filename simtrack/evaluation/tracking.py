@@ -91,6 +91,7 @@ def is_moving(velocity: Float64) -> bool:
 def match_tracks(tracks: Iterable[Track], truth: "Truth") -> dict[str, Track]:
     """Object name -> its believed track: class by class the assignment of least distance within 10 cm."""
     T_camera_map = inverse(truth.T_map_camera)
+    R = T_camera_map[:3, :3]
     objects: defaultdict[str, list[ObjectTruth]] = defaultdict(list)
     for thing in truth.objects.values():
         if thing.kind == "catalogue":
@@ -104,9 +105,9 @@ def match_tracks(tracks: Iterable[Track], truth: "Truth") -> dict[str, Track]:
         candidates = believed[class_name]
         if not candidates:
             continue
-        true = np.stack([(T_camera_map @ thing.T_map_object)[:3, 3] for thing in things])
-        estimated = np.stack([track.T_camera_object[:3, 3] for track in candidates])
-        distances = np.linalg.norm(true[:, None] - estimated[None], axis=2)
+        true = np.array([thing.T_map_object[:3, 3] for thing in things]) @ R.T + T_camera_map[:3, 3]
+        estimated = np.array([track.T_camera_object[:3, 3] for track in candidates])
+        distances = np.sqrt(((true[:, None] - estimated[None]) ** 2).sum(axis=2))
         for row, column in _assign(distances):
             matches[things[row].name] = candidates[column]
     return matches

@@ -92,9 +92,10 @@ class RayBundle:
         if len(steps) != len(boxes) or (len(steps) and steps.min() < 1):
             raise InvalidValueError("strides", strides, f"one number >= 1, or {len(boxes)} of them")
         camera = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
-        size, tables = (intrinsics.width, intrinsics.height), _camera_tables(intrinsics, 1)
-        fields = _window_bundle(boxes, steps, *size, *tables, *camera, packet_width())
-        pixels, directions, order, packed, cones = fields
+        columns, rows = _camera_tables(intrinsics, 1)
+        pixels, directions, order, packed, cones = _window_bundle(
+            boxes, steps, intrinsics.width, intrinsics.height, columns, rows, *camera, packet_width()
+        )
         return RayBundle(directions, order, packed, pixels, (len(pixels),), cones)
 
     @staticmethod

@@ -17,6 +17,7 @@ _MAX_LISTED = 256
 """Kernels look at instances one by one, to see which rays may meet them, up to this number of them."""
 _MUCH_LARGER = 2.0
 """Times the bounding radius of the next largest instance from which on an instance is the ground."""
+_IDENTITY = np.eye(4)
 
 
 class Hierarchy:
@@ -104,7 +105,7 @@ class Hierarchy:
         rtc.embree().api.rtcCommitScene(self._top)
         rtc.embree().check("rtcCommitScene")
         table.members_changed = False
-        ground, T_ground_map = (0, -1), np.eye(4)
+        ground, T_ground_map = (0, -1), _IDENTITY
         if self._ground is not None:
             ground = self._meshes[self._ground].scene_handle, self._ground
             T_ground_map = inverse(table.poses[self._ground])

@@ -145,7 +145,7 @@ class RayScene:
             return
         poses = checked_poses(T_map_mesh, "T_map_mesh", len(instances))
         with self._lock:
-            numbers = np.array([self._known(instance) for instance in instances], np.int64)
+            numbers = self._all_known(instances)
             if self._motions:
                 for instance in instances:
                     self._motions_changed |= self._motions.pop(instance, None) is not None
@@ -435,6 +435,13 @@ class RayScene:
         if instance not in self._meshes:
             raise InvalidValueError("instance", instance, f"one of {self.instances}")
         return instance
+
+    def _all_known(self, instances: Sequence[int]) -> npt.NDArray[np.int64]:
+        self._open()
+        if not self._meshes.keys() >= set(instances):
+            for instance in instances:
+                self._known(instance)
+        return np.array(instances, np.int64)
 
     def _flags(self, instances: Sequence[int] | None) -> Bool:
         """True for the given ids, and False at the end, where the number of a miss points; nothing for None."""

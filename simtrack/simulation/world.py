@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -71,7 +72,11 @@ class World:
 
     def is_catalogue(self, name: str) -> bool:
         """Whether an object of the scene is one that the tracker has a model of."""
-        return any(thing.id == name for thing in self.scene.objects)
+        return name in self._catalogue
+
+    @cached_property
+    def _catalogue(self) -> frozenset[str]:
+        return frozenset(thing.id for thing in self.scene.objects)
 
 
 def build_world(

@@ -13,7 +13,7 @@ import numpy as np
 
 from simtrack.contracts import CameraIntrinsics, Detection, Float64, PoseHypothesis
 from simtrack.errors import InvalidValueError
-from simtrack.geometry.transforms import angle_between, transform
+from simtrack.geometry.transforms import angle_between, exp_so3, transform
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection import pnp_kernels as kernels
 
@@ -131,4 +131,5 @@ def _pnp(
         return None
     if not ok or not np.isfinite(rotation).all() or not np.isfinite(translation).all():
         return None
-    return kernels.refine(transform(cv2.Rodrigues(rotation)[0], translation.ravel()), points, pixels, camera)
+    turn, place = rotation.astype(np.float64).ravel(), translation.astype(np.float64).ravel()
+    return kernels.refine(transform(exp_so3(turn), place), points, pixels, camera)

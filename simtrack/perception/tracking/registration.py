@@ -20,6 +20,8 @@ from simtrack.perception.tracking.iteration import NO_SILHOUETTES, iterate
 from simtrack.perception.tracking.registration_config import RegistrationConfig, Step
 from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
 
+_IDENTITY = np.eye(4)
+
 
 @dataclass(frozen=True, slots=True)
 class TrackedModel:
@@ -236,7 +238,7 @@ class Registration:
         else:
             bundle = RayBundle.from_windows(batch.intrinsics, windows, grids)
         # Rays a few pixels apart meet other triangles of a fine mesh: they are no coherent packets.
-        hits = self._scene.cast(bundle, np.eye(4), coherent=None if (grids == 1).all() else False)
+        hits = self._scene.cast(bundle, _IDENTITY, coherent=None if (grids == 1).all() else False)
         if len(bundle) > len(self._points.weight):
             self._points, self._edges = kernels.Points.room(len(bundle)), kernels.Edges.room(len(bundle))
         return bundle, hits
