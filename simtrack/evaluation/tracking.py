@@ -15,6 +15,9 @@ Definitions
 * *Reacquisition* is the time from an object's visible fraction rising above 0.3 again, after at least 0.2 s below, to a
   confirmed track with ADD(-S) within 10 % of its diameter. One that does not come before the object hides again or the
   run ends counts with the time waited, if that is more than 1 s.
+* The *first track* of an object comes with the first confirmed track that has ADD(-S) within 10 % of its diameter. What
+  counts is the time for which the object could be seen until then, with a visible fraction of at least 0.3: also where
+  it went out of sight meanwhile. An object without one counts with the time waited, if that is more than 1 s.
 """
 
 from collections import defaultdict
@@ -46,6 +49,8 @@ FALSE_AFTER = 1.0
 """Seconds."""
 HIDDEN_AT_LEAST = 0.2
 """Seconds."""
+PATIENCE = 1.0
+"""Seconds: who waits for longer in vain is counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +139,6 @@ class _Reacquisition:
         self._last_wait = 0.0
 
     def observe(self, frame: ObjectFrame) -> None:
-        found = frame.track is not None and frame.track.status is TrackStatus.CONFIRMED and frame.correct
         if not frame.scored:
             self._hide(frame.stamp)
             return
@@ -145,7 +149,7 @@ class _Reacquisition:
         self._ever_seen = True
         if self._waiting_since is not None:
             self._last_wait = (frame.stamp - self._waiting_since) / NANOSECONDS
-            if found:
+            if _confirmed(frame):
                 self._times.append(self._last_wait)
                 self._waiting_since = None
 
@@ -155,7 +159,7 @@ class _Reacquisition:
 
     @property
     def _in_vain(self) -> bool:
-        return self._waiting_since is not None and self._last_wait > 1.0
+        return self._waiting_since is not None and self._last_wait > PATIENCE
 
     def _hide(self, stamp: int) -> None:
         if self._in_vain:
@@ -163,6 +167,35 @@ class _Reacquisition:
         self._waiting_since = None
         if self._hidden_since is None and self._ever_seen:
             self._hidden_since = stamp
+
+
+class _FirstTrack:
+    """How long one object could be seen until it was tracked for the first time."""
+
+    def __init__(self) -> None:
+        self._waited = 0
+        self._found = False
+        self._seen: int | None = None
+        """Stamp of the last frame, if the object could be seen in it."""
+
+    def observe(self, frame: ObjectFrame) -> None:
+        if self._found:
+            return
+        if frame.scored and self._seen is not None:
+            self._waited += frame.stamp - self._seen
+        self._seen = frame.stamp if frame.scored else None
+        self._found = frame.scored and _confirmed(frame)
+
+    @property
+    def time(self) -> float | None:
+        """Seconds; None for an object that has hardly been in sight."""
+        waited = self._waited / NANOSECONDS
+        return waited if self._found or waited > PATIENCE else None
+
+
+def _confirmed(frame: ObjectFrame) -> bool:
+    """Whether an object is tracked where it is."""
+    return frame.track is not None and frame.track.status is TrackStatus.CONFIRMED and frame.correct
 
 
 class TrackingEvaluator:
@@ -177,6 +210,7 @@ class TrackingEvaluator:
         self._unmatched: dict[int, int] = {}
         self._false: dict[int, int] = {}
         self._reacquisition: defaultdict[str, _Reacquisition] = defaultdict(_Reacquisition)
+        self._first: defaultdict[str, _FirstTrack] = defaultdict(_FirstTrack)
         self._previous_stamp: int | None = None
 
     @property
@@ -201,6 +235,7 @@ class TrackingEvaluator:
         ]
         for frame in frames:
             self._reacquisition[frame.name].observe(frame)
+            self._first[frame.name].observe(frame)
             if frame.track is not None:
                 last = self._last_match.setdefault(frame.name, frame.track.id)
                 if last != frame.track.id:
@@ -268,6 +303,11 @@ class TrackingEvaluator:
         missing = "no object came into sight again"
         metrics["tracking.reacquisition_time.p95"] = quantile(times, 0.95, "s", missing)
         metrics["tracking.reacquisitions"] = measured(len(times), "1")
+        times = [each.time for each in self._first.values() if each.time is not None]
+        missing = "no object was in sight for long enough"
+        metrics["tracking.first_track_time.median"] = quantile(times, 0.5, "s", missing)
+        metrics["tracking.first_track_time.max"] = quantile(times, 1.0, "s", missing)
+        metrics["tracking.first_tracks"] = measured(len(times), "1")
         metrics["world.known_share"] = ratio(np.count_nonzero(table.known), len(self.frames), "no catalogue object")
         return metrics
 

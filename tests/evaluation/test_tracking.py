@@ -135,6 +135,35 @@ def test_an_object_never_found_again_counts_with_the_time_waited(world, scorers)
     assert reacquisition_times(world, scorers, visible, [True] + [False] * 25) == (1, pytest.approx(2.0))
 
 
+def first_track_times(world, scorers, visible: list[float], tracked: list[bool], **changes):
+    evaluator = TrackingEvaluator(scorers)
+    for k, (fraction, found) in enumerate(zip(visible, tracked, strict=True)):
+        tracks = [world.track("meter", 1, k * TENTH, **changes)] if found else []
+        evaluator.observe(tracks, world.truth(k * TENTH), {"meter": fraction})
+    result = values(evaluator)
+    return result["tracking.first_tracks"], result["tracking.first_track_time.max"]
+
+
+def test_the_first_track_is_waited_for_while_the_object_can_be_seen(world, scorers) -> None:
+    visible, tracked = [0.2] * 3 + [0.8] * 5, [False] * 6 + [True] * 2
+    assert first_track_times(world, scorers, visible, tracked) == (1, pytest.approx(0.3))
+    # The time out of sight does not count, and what is lost later is no first track any more.
+    visible, tracked = [0.8] * 3 + [0.0] * 20 + [0.8] * 6, [False] * 25 + [True] + [False] * 3
+    assert first_track_times(world, scorers, visible, tracked) == (1, pytest.approx(0.4))
+
+
+def test_a_first_track_is_confirmed_and_in_place(world, scorers) -> None:
+    visible, tracked = [0.8] * 16, [True] * 16
+    assert first_track_times(world, scorers, visible, tracked) == (1, 0.0)
+    for change in ({"status": TrackStatus.OCCLUDED}, {"xi": (0.09, 0, 0, 0, 0, 0)}):
+        assert first_track_times(world, scorers, visible, tracked, **change) == (1, pytest.approx(1.5))
+
+
+def test_objects_without_a_track_count_once_they_were_in_sight_for_a_second(world, scorers) -> None:
+    assert first_track_times(world, scorers, [0.8] * 11, [False] * 11) == (0, None)
+    assert first_track_times(world, scorers, [0.8] * 12, [False] * 12) == (1, pytest.approx(1.1))
+
+
 def test_floor_ratio_compares_with_the_registration_from_the_truth(world, scorers) -> None:
     evaluator = TrackingEvaluator(scorers)
     tracks = all_tracks(world, xi=(0.003, 0, 0, 0, 0, 0))
