@@ -1,5 +1,6 @@
 """Boxes from the box network's answer."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,8 @@ STRIDE = 8
 SAME = 0.5
 """Boxes of one class that overlap by more than this are one object's."""
 MAX_BOXES = 40
+LEAST_SIDE = 8.0
+"""Regions that are narrower or lower than this are no boxes, pixels of the image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,29 @@ def decoded_boxes(logits: np.ndarray, distances: np.ndarray, threshold: float) -
         if len(found) == MAX_BOXES:
             break
     return found
+
+
+def boxes_of_regions(logits: np.ndarray, regions: Sequence[Float64], scale: Float64, threshold: float) -> list[Box]:
+    """Regions of an image as boxes of the classes that have a centre in them, best first.
+
+    Where objects overlap, the network's centres of them may be one, and its boxes hold both.
+
+    Args:
+        logits: (classes, h, w), of objects' centres.
+        regions: (4,) each, pixels of the image: x min, y min, x max, y max, half-open.
+        scale: (2,), pixels of the image in one of the network's input.
+        threshold: 0 to 1.
+    """
+    scores = 1.0 / (1.0 + np.exp(-logits.astype(float)))
+    found: list[Box] = []
+    for corners in regions:
+        if min(corners[2] - corners[0], corners[3] - corners[1]) < LEAST_SIDE:
+            continue
+        u0, v0 = np.maximum(np.floor(corners[:2] / (scale * STRIDE)).astype(int), 0)
+        u1, v1 = np.maximum(np.ceil(corners[2:] / (scale * STRIDE)).astype(int), 0)
+        best = scores[:, v0:v1, u0:u1].max(axis=(1, 2), initial=0.0)
+        found += [Box(int(c), corners - 0.5, float(best[c])) for c in np.flatnonzero(best > threshold)]
+    return sorted(found, key=lambda box: -box.score)
 
 
 def overlap(a: Float64, b: Float64) -> float:

@@ -66,6 +66,8 @@ class PoseSearchConfig:
     """... largest one, radians ..."""
     last_step: float = 1e-4
     """... and one that is shorter than this is the last on the same rays, metres of surface."""
+    slip: float = 10.0
+    """A refinement that raises a pose's cost by more than this has slid onto something else."""
     distinct: float = np.deg2rad(20.0)
     """Hypotheses nearer to each other than this are the same, radians."""
 

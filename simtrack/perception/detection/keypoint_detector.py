@@ -25,7 +25,7 @@ from simtrack.contracts import (
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection.bins import BEFORE, BINS, LEAST_SIGMA, decoded
-from simtrack.perception.detection.boxes import STRIDE, Box, decoded_boxes
+from simtrack.perception.detection.boxes import STRIDE, Box, boxes_of_regions, decoded_boxes
 from simtrack.perception.detection.onnx_network import OnnxNetwork, Runtime, open_network
 from simtrack.perception.detection.views import (
     WINDOW,
@@ -56,6 +56,14 @@ class KeypointDetectorConfig:
     """Boxes with a lower score are not looked at."""
     present: float = 0.95
     """Windows in which the object is with less probability than this are dropped."""
+    hint: float = 0.2
+    """Boxes with at least this score are looked at, too, and regions that nothing explains with such a centre ..."""
+    hints: int = 12
+    """... at most so many, those with the highest scores; they are dropped ..."""
+    hint_present: float = 0.99
+    """... if the object is there with less probability than this."""
+    same: float = 0.25
+    """Objects of a class whose centres are nearer to each other than this are the same, in shares of a box's side."""
     max_sigma: float = 0.3
     """Keypoints that are less certain than this, in shares of the window's side, are left out (NaN)."""
     runtime: Runtime = "onnxruntime"
@@ -110,14 +118,35 @@ class KeypointDetector:
         return self._names
 
     def detect(self, frame: RgbdFrame, regions: Sequence[RegionOfInterest] = ()) -> DetectionResult:
-        """Detect the objects in the image of a frame; the regions are not looked at."""
+        """Detect the objects in the image of a frame.
+
+        Regions that nothing explains have windows of their own beside those of the boxes that the first network tells:
+        where objects overlap, that takes them for one.
+        """
         available = frame.stamp + int(self.config.latency * NANOSECONDS)
         if frame.rgb is None:
             return DetectionResult(frame.stamp, available, (), Status.NO_DATA)
-        found = self.boxes(frame.rgb, frame.depth)
-        return DetectionResult(
-            frame.stamp, available, self.keypoints(found, frame.rgb, frame.depth, frame.intrinsics.fx)
-        )
+        heat, sides, scale = self._look(frame.rgb, frame.depth)
+        boxes = self._decoded(heat, sides, scale, min(self.config.hint, self.config.box_score))
+        clear = [box for box in boxes if box.score > self.config.box_score]
+        unexplained = [region.box for region in regions if region.sensor == "camera"]
+        hints = boxes[len(clear) :] + boxes_of_regions(heat, unexplained, scale, self.config.hint)
+        hints = sorted((b for b in hints if self._diameters[b.class_index]), key=lambda b: -b.score)[
+            : self.config.hints
+        ]
+        image = frame.rgb, frame.depth, frame.intrinsics.fx
+        found = self.keypoints(clear, *image)
+        further = self.keypoints(hints, *image, least_present=self.config.hint_present)
+        return DetectionResult(frame.stamp, available, (*found, *self._unlike(further, found)))
+
+    def _unlike(self, further: Sequence[Detection], found: Sequence[Detection]) -> list[Detection]:
+        """Those of further detections that are not of the same object as one that was found, or as a better one."""
+        kept = list(found)
+        for detection in sorted(further, key=lambda d: -d.score):
+            side = self.config.same * float(np.max(detection.box[2:] - detection.box[:2]))
+            if all(d.class_name != detection.class_name or _apart(d, detection) > side for d in kept):
+                kept.append(detection)
+        return kept[len(found) :]
 
     def boxes(self, rgb: Uint8, depth: Float32, least_score: float | None = None) -> list[Box]:
         """Boxes of the wanted objects in an image, in its own pixels, best first; from the configured score on if None.
@@ -127,14 +156,22 @@ class KeypointDetector:
             depth: (H, W), metres, 0 = no reading.
             least_score: 0 to 1.
         """
-        least_score = self.config.box_score if least_score is None else least_score
+        return self._decoded(*self._look(rgb, depth), self.config.box_score if least_score is None else least_score)
+
+    def _look(self, rgb: Uint8, depth: Float32) -> tuple[np.ndarray, np.ndarray, Float64]:
+        """Centres (classes, h, w) and sides (4, h, w) as the first network tells them; its pixels in the image's."""
         small = shown_image(*reduced(rgb, depth, *self._size))
         heat, sides = self._boxes.run({"image": small[None]})
-        scale = np.tile(np.array(depth.shape[::-1]) / np.array(self._size), 2)
-        wanted = (box for box in decoded_boxes(heat[0], sides[0], least_score) if self._diameters[box.class_index])
+        return heat[0], sides[0], np.array(depth.shape[::-1]) / np.array(self._size)
+
+    def _decoded(self, heat: np.ndarray, sides: np.ndarray, scale: Float64, least_score: float) -> list[Box]:
+        scale = np.tile(scale, 2)
+        wanted = (box for box in decoded_boxes(heat, sides, least_score) if self._diameters[box.class_index])
         return [Box(box.class_index, (box.corners + 0.5) * scale - 0.5, box.score) for box in wanted]
 
-    def keypoints(self, boxes: Sequence[Box], rgb: Uint8, depth: Float32, focal: float) -> tuple[Detection, ...]:
+    def keypoints(
+        self, boxes: Sequence[Box], rgb: Uint8, depth: Float32, focal: float, least_present: float | None = None
+    ) -> tuple[Detection, ...]:
         """Look closer at boxes.
 
         Args:
@@ -142,9 +179,11 @@ class KeypointDetector:
             rgb: (H, W, 3).
             depth: (H, W), metres, 0 = no reading.
             focal: length in pixels.
+            least_present: least probability, 0 to 1; the configured one if None.
         """
         if not boxes:
             return ()
+        least_present = self.config.present if least_present is None else least_present
         pyramid, size = Pyramid(rgb), self._window
         windows = [window_about(box.corners) for box in boxes]
         shown, told = [], []
@@ -159,7 +198,7 @@ class KeypointDetector:
         places, spreads = decoded(coordinates)
         there = 1.0 / (1.0 + np.exp(-present.astype(float)))
         answers = zip(boxes, windows, places, spreads, there.tolist(), strict=True)
-        return tuple(self._detection(*answer) for answer in answers if answer[4] >= self.config.present)
+        return tuple(self._detection(*answer) for answer in answers if answer[4] >= least_present)
 
     def _detection(self, box: Box, window: Window, places: Float64, spreads: Float64, there: float) -> Detection:
         first = np.array([window.u, window.v]) - 0.5 * window.side
@@ -169,6 +208,17 @@ class KeypointDetector:
         pixels[spread > self.config.max_sigma] = np.nan
         sigma = np.maximum(spread, LEAST_SIGMA) * (self._sigma_scale * window.side)
         return Detection(self._names[box.class_index], pixels, sigma, box.corners, float(np.sqrt(box.score * there)))
+
+
+def _apart(a: Detection, b: Detection) -> float:
+    """Pixels between the centres of two boxes."""
+    return 0.5 * float(np.linalg.norm(a.box[:2] + a.box[2:] - b.box[:2] - b.box[2:]))
+
+
+def known_classes(folder: Path) -> tuple[str, ...]:
+    """Names of the objects that the networks of a folder can find; raises FileFormatError."""
+    network = open_network(folder / BOXES, "onnxruntime")
+    return _classes(network, _told(network, "boxes"), {})
 
 
 def _told(network: OnnxNetwork, kind: str, **fixed: float) -> dict[str, Any]:

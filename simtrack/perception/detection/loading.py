@@ -30,6 +30,17 @@ def check_image_detector(given: str) -> None:
             )
 
 
+def known_classes(given: str) -> tuple[str, ...]:
+    """Names of the objects that the networks of a folder, or those that come along, can find.
+
+    Raises:
+        FileFormatError: a file is missing or is not what it should be.
+    """
+    from simtrack.perception.detection import keypoint_detector as own
+
+    return own.known_classes(own.SHIPPED if given == KEYPOINTS else Path(given))
+
+
 def make_image_detector(given: str, models: Mapping[str, ObjectModel]) -> Detector:
     """Open a detector.
 

@@ -30,7 +30,9 @@ from simtrack.perception.tracking.registration_config import RegistrationConfig
 from simtrack.raycast import RayScene, TriangleMesh
 
 STEPS = ((0.03, 10.0), (0.03, 8.0), (0.02, 6.0), (0.015, 5.0))
-"""Of the refinement: gates in metres and scales of the robust kernel, as of `Step`."""
+"""Of the refinement: gates in metres and scales of the robust kernel, as of `Step` ..."""
+NARROW_STEPS = ((0.012, 6.0), (0.012, 5.0), (0.01, 5.0))
+"""... and where those slide onto something else."""
 REGISTRATION = RegistrationConfig()
 
 
@@ -80,8 +82,7 @@ class PoseSearch:
         scores = self._slide(evidence, shown, rotations, shifts)
         placed = np.array([transform(R, t) for R, t in zip(rotations, shifts, strict=True)])
         poses = self._distinct(placed, costs - self.config.depth_weight * scores, shown, self.config.refined)
-        self._refine(evidence, shown, poses)
-        costs, supports = self._judge(evidence, shown, poses)
+        poses, costs, supports = self._refined(evidence, shown, poses)
         seen = supports >= self.config.least_support
         best = self._distinct(poses[seen], costs[seen], shown, self.config.kept)
         return [_hypothesis(evidence, T, detection, stamp) for T in best]
@@ -137,7 +138,28 @@ class PoseSearch:
             order = order[nearest < 1.0 + 2.0 * np.cos(self.config.distinct)]
         return poses[kept]
 
-    def _refine(self, e: Evidence, shown: ShownModel, poses: Float64) -> None:
+    def _refined(self, e: Evidence, shown: ShownModel, poses: Float64) -> tuple[Float64, Float64, Float64]:
+        """Poses (H, 4, 4) refined, their costs (H,) and supports (H,).
+
+        The solver knows of depth alone, and takes a hand for the object in it, against keypoints and silhouette.
+        Where that made a pose so much worse, it is done again with what is near, or the pose stays as it was.
+        """
+        before, supports = self._judge(e, shown, poses)
+        refined = poses.copy()
+        self._refine(e, shown, refined, STEPS)
+        costs, support = self._judge(e, shown, refined)
+        slid = costs > before + self.config.slip
+        if slid.any():
+            refined[slid], costs[slid], support[slid] = poses[slid], before[slid], supports[slid]
+            again = poses[slid]
+            self._refine(e, shown, again, NARROW_STEPS)
+            after, seen = self._judge(e, shown, again)
+            better = np.flatnonzero(slid)[after < before[slid]]
+            chosen = after < before[slid]
+            refined[better], costs[better], support[better] = again[chosen], after[chosen], seen[chosen]
+        return refined, costs, support
+
+    def _refine(self, e: Evidence, shown: ShownModel, poses: Float64, steps: Sequence[tuple[float, float]]) -> None:
         """Move poses (H, 4, 4) by the registration's solver on coarse rays, in place."""
         count = len(poses)
         grid = e.grid(self.config.fine_rays)
@@ -145,7 +167,7 @@ class PoseSearch:
         radii, alone, active = np.full(count, shown.radius), np.ones((count, 2)), np.ones(count, bool)
         covariance, constrained, stats = np.zeros((count, 6, 6)), np.zeros(count, np.int64), np.zeros((count, 3))
         moved, deviations = np.zeros(count), np.zeros(count)
-        for gate, kernel in STEPS:
+        for gate, kernel in steps:
             pairs = self._paired(e, grid, shown, poses, gate, points)[0]
             settings = solver.SolverSettings(
                 kernel, 1.0, solver.EDGES_NEVER, REGISTRATION.edge_sigma, REGISTRATION.unconstrained_sigma,
@@ -202,7 +224,7 @@ class PoseSearch:
 
 
 def _hypothesis(e: Evidence, T: Float64, detection: Detection, stamp: int) -> PoseHypothesis:
-    error = np.sqrt(pnp_kernels.squared_error(T, e.keypoints, e.pixels, e.camera) / len(e.pixels))
+    error = np.sqrt(pnp_kernels.squared_error(T, e.keypoints, e.pixels, e.camera) / max(len(e.pixels), 1))
     covariance = PnpConfig().error_correlation * np.asarray(
         pnp_kernels.covariance(T, e.keypoints, e.sigma, e.camera), np.float64
     )

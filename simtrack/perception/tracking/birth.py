@@ -105,6 +105,7 @@ class Prober:
         self._refine = [replace(step, repeats=min(step.repeats, 2)) for step in schedule[3:]]
         self._follow = registration.track_schedule
         self._narrow = [replace(step, repeats=2, coarsen=2) for step in registration.track_schedule]
+        self._held = [replace(registration.near, repeats=6), replace(registration.track_schedule[-1], repeats=4)]
         self._registration = Registration(probe)
         self._shown: dict[int, TrackedModel] = {}
         self._fixed: dict[int, Float64] = {}
@@ -128,8 +129,17 @@ class Prober:
         """Register each alternative and return the one that fits best, or None if none can be believed."""
         self._show(model, occluders)
         near = self._near(hypotheses, depth, intrinsics)
-        if near:
-            return self._settled(near, depth, intrinsics)
+        found = self._settled(near, depth, intrinsics) if near else self._searched(hypotheses, depth, intrinsics)
+        if found is not None:
+            return found
+        # What is in a hand has the hand's surface closely before it, to which wider gates lead away.
+        held = [self._register(h.T_camera_object, depth, intrinsics, self._held) for h in hypotheses]
+        return min((r for r in held if r is not None and believable(r, self._fit)), key=cost, default=None)
+
+    def _searched(
+        self, hypotheses: Sequence[PoseHypothesis], depth: Float32, intrinsics: CameraIntrinsics
+    ) -> RegistrationResult | None:
+        """The best fit from poses that are slid to the measured depth, if it can be believed."""
         starts = [T for h in hypotheses for T in self._aligned(h.T_camera_object, depth, intrinsics)]
         result = self._best_of(starts, depth, intrinsics)
         if result is not None and self._fit.promising < result.support and not self._good(result):

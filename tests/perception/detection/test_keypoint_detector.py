@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simtrack.contracts import NANOSECONDS, CameraIntrinsics, Detector, RgbdFrame, Status
+from simtrack.contracts import NANOSECONDS, CameraIntrinsics, Detector, RegionOfInterest, RgbdFrame, Status
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.geometry.meshes import box_mesh
 from simtrack.geometry.transforms import exp_so3, transform
@@ -49,6 +49,7 @@ class Answers:
         self.keypoints = project_points(T_camera_object, brick().keypoints, CAMERA)
         self.box = np.concatenate([self.keypoints.min(axis=0), self.keypoints.max(axis=0)])
         self.present = present
+        self.centre = 4.0
 
     def boxes(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         assert inputs["image"].shape == (1, 5, SMALL[1], SMALL[0])
@@ -56,18 +57,19 @@ class Answers:
         u0, v0, u1, v1 = ((self.box + 0.5) / 2 - 0.5 + 0.5) / STRIDE - 0.5  # half the size, then cells
         u, v = round((u0 + u1) / 2), round((v0 + v1) / 2)
         heat, sides = np.full((1, 2, h, w), -9.0, np.float32), np.zeros((1, 4, h, w), np.float32)
-        heat[0, 0, v, u] = 4.0
+        heat[0, 0, v, u] = self.centre
         sides[0, :, v, u] = np.log([u - u0, v - v0, u1 - u, v1 - v])
         return [heat, sides]
 
     def windows(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        assert inputs["window"].shape == (1, 5, 64, 64)
-        assert inputs["told"].shape == (1, 4)
+        count = len(inputs["window"])
+        assert inputs["window"].shape == (count, 5, 64, 64)
+        assert inputs["told"].shape == (count, 4)
         window = window_about(self.box)
         places = (self.keypoints - [window.u, window.v]) / window.side + 0.5
         position = position_of(places)
         logits = -0.5 * ((np.arange(BINS) - position[..., None]) / 1.3) ** 2
-        return [logits[None].astype(np.float32), np.array([self.present], np.float32)]
+        return [np.tile(logits.astype(np.float32), (count, 1, 1, 1)), np.full(count, self.present, np.float32)]
 
 
 @pytest.fixture
@@ -119,9 +121,41 @@ def test_boxes_in_which_nothing_is_are_dropped(opened: dict[str, Any]) -> None:
     assert KeypointDetector(models(), Path("x")).detect(frame(np.zeros((480, 640, 3), np.uint8))).detections == ()
 
 
+def region(box: np.ndarray, sensor: str = "camera") -> RegionOfInterest:
+    return RegionOfInterest(7 * NANOSECONDS, box + 0.5, np.zeros(3), np.zeros(3), 900, sensor)
+
+
+def test_weak_centres_want_surer_windows(opened: dict[str, Any]) -> None:
+    answers, image = opened["answers"]["instance"], frame(np.zeros((480, 640, 3), np.uint8))
+    for centre, present, count in (
+        (4.0, 3.5, 1),  # scores of 0.98 and 0.97
+        (-1.2, 3.5, 0),  # 0.23
+        (-1.2, 6.0, 1),  # the window 0.998
+        (-2.0, 6.0, 0),  # 0.12
+    ):
+        answers.centre, answers.present = centre, present
+        assert len(KeypointDetector(models(), Path("x")).detect(image).detections) == count
+
+
+def test_regions_that_nothing_explains_have_windows_of_their_own(opened: dict[str, Any]) -> None:
+    answers, image = opened["answers"]["instance"], frame(np.zeros((480, 640, 3), np.uint8))
+    box, detector = answers.box, KeypointDetector(models(), Path("x"))
+    beside = box + 0.4 * (box[2] - box[0]) * np.array([1.0, 0.0, 1.0, 0.0])
+    # What has box and region is one object, and so are regions that are nearly the same.
+    for regions, found in (([region(box)], [box]), ([region(beside), region(beside + 1.0)], [box, beside])):
+        detections = detector.detect(image, regions).detections
+        assert len(detections) == len(found)
+        assert all(np.abs(d.box - b).max() < 1.1 for d, b in zip(detections, found, strict=True))
+    assert len(detector.detect(image, [region(beside, "lidar")]).detections) == 1
+    none = KeypointDetector(models(), Path("x"), KeypointDetectorConfig(hints=0))
+    assert len(none.detect(image, [region(beside)]).detections) == 1
+    answers.present = 3.5
+    assert len(detector.detect(image, [region(beside)]).detections) == 1
+
+
 def test_objects_that_nobody_asked_for_are_let_be(opened: dict[str, Any]) -> None:
-    detector = KeypointDetector({"tile": models()["tile"]}, Path("x"))
-    assert detector.detect(frame(np.zeros((480, 640, 3), np.uint8))).detections == ()
+    detector, box = KeypointDetector({"tile": models()["tile"]}, Path("x")), opened["answers"]["instance"].box
+    assert detector.detect(frame(np.zeros((480, 640, 3), np.uint8)), [region(box)]).detections == ()
 
 
 def test_without_colour_there_is_no_data(opened: dict[str, Any]) -> None:

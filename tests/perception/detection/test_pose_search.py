@@ -12,7 +12,7 @@ from simtrack.objects import load_object
 from simtrack.perception.detection import search_kernels as kernels
 from simtrack.perception.detection.evidence import Evidence, PoseSearchConfig, rotation_grid
 from simtrack.perception.detection.pnp import project_points, solve_pose
-from simtrack.perception.detection.pose_search import PoseSearch
+from simtrack.perception.detection.pose_search import STEPS, PoseSearch
 from simtrack.perception.tracking.association import rotation_apart
 from tests.perception.tracking.scenes import INTRINSICS, BenchWorld, in_camera, on_bench
 
@@ -140,6 +140,35 @@ def test_keypoints_that_are_too_poor_for_pnp_do_with_depth(name: str, depth: Flo
         assert np.all(np.linalg.eigvalsh(found[0].covariance) > 0.0)
     assert good >= 5
     assert poor >= 4
+
+
+def test_a_refinement_does_not_slide_onto_a_hand(depth: Float32, search: PoseSearch) -> None:
+    """Something close before a part of an object draws the solver, against keypoints and silhouette."""
+    rng, held = np.random.default_rng(5), depth.copy()
+    T, shown, detection = in_camera(PLACES["klt3147"][1]), search.shown("klt3147"), detected("klt3147")
+    u0, v0, u1, v1 = detection.box.astype(int)
+    part = held[v0 : v0 + 7 * (v1 - v0) // 10, u0:u1]
+    part[part < T[2, 3] + 0.15] -= 0.025
+    e = Evidence.of(detection, shown, held, INTRINSICS, search.config)
+    assert e is not None
+    starts = np.array([T @ transform(exp_so3(rng.normal(0.0, 0.05, 3)), rng.normal(0.0, 0.003, 3)) for _ in range(24)])
+    before, moved = search._judge(e, shown, starts)[0], starts.copy()
+    search._refine(e, shown, moved, STEPS)
+    slid = search._judge(e, shown, moved)[0] > before + search.config.slip
+    poses, costs, supports = search._refined(e, shown, starts)
+    assert slid.any()
+    assert np.all(costs[slid] <= before[slid])
+    assert np.array_equal(poses[~slid], moved[~slid])
+    again = search._judge(e, shown, poses)
+    assert np.allclose(again[0], costs) and np.allclose(again[1], supports)
+
+
+def test_without_any_keypoint_box_and_depth_are_left(depth: Float32, search: PoseSearch) -> None:
+    detection = detected("powerdrill")
+    detection.keypoints[:] = np.nan
+    found = search.search(detection, depth, INTRINSICS, 0)
+    assert found
+    assert all(h.reprojection_error == 0.0 and np.isfinite(h.covariance).all() for h in found)
 
 
 def test_few_keypoints_are_enough(depth: Float32, search: PoseSearch) -> None:

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtrack.perception.detection.bins import BEFORE, BINS, decoded, place_of, position_of
-from simtrack.perception.detection.boxes import STRIDE, decoded_boxes, overlap
+from simtrack.perception.detection.boxes import STRIDE, boxes_of_regions, decoded_boxes, overlap
 from simtrack.perception.detection.views import (
     Pyramid,
     Window,
@@ -104,3 +104,17 @@ def test_a_window_is_square_about_its_box() -> None:
     image = np.zeros((60, 60), np.float32)
     image[30, 30] = 1.0
     assert warped(image, window.pixels_of(60), 60, smooth=False)[30, 30] == 1.0
+
+
+def test_regions_are_boxes_of_the_classes_that_have_a_centre_in_them() -> None:
+    logits = np.full((3, 30, 40), -9.0, np.float32)
+    logits[1, 10, 20], logits[2, 11, 20], logits[0, 2, 2] = 0.0, 2.0, 3.0
+    scale = np.array([2.0, 2.0])  # a cell is 16 pixels of the image
+    around = np.array([310.0, 150.0, 350.0, 200.0])
+    found = boxes_of_regions(logits, [around], scale, 0.1)
+    assert [box.class_index for box in found] == [2, 1]
+    assert [box.score for box in found] == [float(1.0 / (1.0 + np.exp(-2.0))), 0.5]
+    assert all(np.array_equal(box.corners, around - 0.5) for box in found)
+    narrow, empty, outside = np.array([310.0, 150, 317, 200]), around + 100.0, around + 1000.0
+    assert boxes_of_regions(logits, [narrow, empty, outside, -outside[[2, 3, 0, 1]]], scale, 0.1) == []
+    assert boxes_of_regions(logits, [around], scale, 0.9) == []
