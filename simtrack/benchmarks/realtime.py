@@ -78,13 +78,13 @@ def run(options: Options) -> Benchmark:
 
 def _record(log: Path, duration: float, options: Options) -> None:
     from simtrack.evaluation.closed_loop import ClosedLoopRun
-    from simtrack.evaluation.run_config import RunConfig
+    from simtrack.evaluation.run_config import ORACLE, RunConfig
     from simtrack.simulation.scene_file import load_scene
 
     options.say(f"recording {duration:g} s of the workbench; this takes a few times as long")
     config = RunConfig(
         scene=load_scene("workbench"), out=log.parent / "run", duration=duration, seed=options.seed, log=log,
-        threads=options.threads,
+        threads=options.threads, detector=ORACLE,
     )  # fmt: skip
     ClosedLoopRun(config).run()
 

@@ -35,7 +35,7 @@ def attribute(
         stages: What becomes perfect, in this order.
         tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
         localizer: A localizer of yours, package.module:Class.
-        detector: What detects objects in images: oracle, or package.module:Class.
+        detector: What detects objects in images: oracle, keypoints, or another as of `simtrack run`.
         renderer: mujoco needs OpenGL (EGL), embree needs none.
         alone: Also make each stage perfect alone; without, half as many runs.
         out: Folder for attribution.json and attribution.html; runs/SCENE-SEED-attribution if not given.

@@ -60,6 +60,13 @@ def show_warning(
     console.print(Text.assemble(("warning: ", "bold yellow"), str(message)))
 
 
+def show_choice(what: str, chosen: str, reason: str) -> None:
+    """Tell what was chosen for the user, and why."""
+    from rich.text import Text
+
+    out().print(Text.assemble(f"{what}: ", (chosen, "bold"), f" ({reason})"))
+
+
 _LEAST_TEXT = 20
 """Characters of a column of text that are not given away to the others."""
 

@@ -20,7 +20,7 @@ def run(
     agent: str | None = None,
     tracker: str | None = None,
     localizer: str | None = None,
-    detector: str = "oracle",
+    detector: str | None = None,
     scene_graph: str | None = None,
     stage_limit: float = 5.0,
     given: str = "",
@@ -44,9 +44,9 @@ def run(
         agent: Decides where the robot looks and drives: explorer, fixed-gaze, patrol, route; by default the scene's.
         tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
         localizer: A localizer of yours, package.module:Class, or oracle: one that knows the truth.
-        detector: What detects objects in images: oracle (knows the truth, and errs like a trained network), keypoints
-            (the networks that come along), a folder that `simtrack train detector` wrote, a YOLOv8-pose .onnx file, or
-            package.module:Class.
+        detector: What detects objects in images: keypoints (the networks that come along), oracle (knows the truth, and
+            errs like a trained network), a folder that `simtrack train detector` wrote, a YOLOv8-pose .onnx file, or
+            package.module:Class; by default keypoints where they know all objects of the scene, else oracle.
         scene_graph: What says how things stand to each other, of yours, package.module:Class.
         stage_limit: Seconds that a stage of yours has for a frame; after that the frame counts as missed.
         given: Conditions: noise=2,occlusion=3 (see docs/instrument.md).
@@ -87,6 +87,8 @@ def run(
         static_map=None if map is None else Path(map),
     )  # fmt: skip
     observers = _observers(view, rrd)
+    if detector is None:
+        console.show_choice("detector", config.detector_choice.name, config.detector_choice.reason)
     with console.ProgressLine(f"{loaded.name} · seed {seed}") as line, cold_start_told(line.say):
 
         def show(progress: "Progress") -> None:
@@ -120,7 +122,7 @@ def _summarise(record: "RunRecord") -> None:
     from simtrack.evaluation.targets import targets_of
     from simtrack.report.headline import table
 
-    targets = targets_of(record.scene)
+    targets = targets_of(record.scene, str(record.config["detector"]))
     names = [name for name in (targets or record.metrics) if name in record.metrics]
     marks = {"good": Text("✓", "green"), "bad": Text("✗", "red"), "": Text("")}
     rows = [

@@ -40,7 +40,7 @@ def sweep(
         given: Conditions that hold everywhere: noise=2,speed=0.5.
         tracker: A tracker of yours, package.module:Class or exec:PROGRAM (docs/bring_your_own.md).
         localizer: A localizer of yours, package.module:Class, or oracle.
-        detector: What detects objects in images: oracle, or package.module:Class.
+        detector: What detects objects in images: oracle, keypoints, or another as of `simtrack run`.
         renderer: mujoco needs OpenGL (EGL), embree needs none.
         metrics: Which are printed and drawn first; the files have all.
         out: Folder for sweep.json, sweep.csv and sweep.html; runs/SCENE-sweep if not given.

@@ -170,10 +170,11 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
 
 
 def _own_detector(config: RunConfig, simulation: Simulation) -> Detector:
-    if config.detector == ORACLE:
+    name = config.detector_choice.name
+    if name == ORACLE:
         offset = simulation.calibration.camera_time_offset
         return OracleDetector(simulation.truth, simulation.models, config.seed, config.oracle, offset)
-    return make_image_detector(config.detector, simulation.models)
+    return make_image_detector(name, simulation.models)
 
 
 @dataclass(slots=True)

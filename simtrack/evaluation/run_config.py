@@ -8,6 +8,7 @@ from pathlib import Path
 import simtrack
 from simtrack.contracts import Command
 from simtrack.errors import InvalidValueError, UnknownNameError
+from simtrack.evaluation.detector_choice import ORACLE, DetectorChoice, choose_detector
 from simtrack.perception.detection.loading import ALLOWED as IMAGE_DETECTORS
 from simtrack.perception.detection.loading import check_image_detector, is_image_detector
 from simtrack.perception.foreign import check_stage
@@ -18,8 +19,6 @@ from simtrack.simulation.oracles import OracleDetectorConfig
 from simtrack.simulation.scene_file import SceneFile
 from simtrack.simulation.survey_files import check_survey
 
-ORACLE = "oracle"
-"""The detector that knows the truth, and errs like a trained network; the localizer that knows it and does not err."""
 RENDERERS = ("mujoco", "embree")
 DEFAULT_AGENT, FIXED_GAZE = "explorer", "fixed-gaze"
 _PACKAGES = ("mujoco", "numpy", "numba", "embreex", "opencv-python-headless", "scipy", "pyoxigraph", "onnxruntime")
@@ -36,9 +35,9 @@ class RunConfig:
     seed: int = 0
     agent: str | None = None
     """The scene's own, or the explorer, if None."""
-    detector: str = ORACLE
+    detector: str | None = None
     """The oracle, one of simtrack's own that look at images (`simtrack.perception.detection.loading`), or
-    ``package.module:Class``."""
+    ``package.module:Class``; if None, see `simtrack.evaluation.detector_choice`."""
     oracle: OracleDetectorConfig = field(default_factory=OracleDetectorConfig)
     """How the oracle detector errs."""
     tracker: str | None = None
@@ -74,10 +73,11 @@ class RunConfig:
         ):
             if name not in known:
                 raise UnknownNameError(kind, name, known)
-        if is_image_detector(self.detector):
-            check_image_detector(self.detector)
-        elif ":" not in self.detector and self.detector != ORACLE:
-            raise UnknownNameError("detector", self.detector, (ORACLE, *IMAGE_DETECTORS, "package.module:Class"))
+        detector = self.detector_choice.name
+        if is_image_detector(detector):
+            check_image_detector(detector)
+        elif ":" not in detector and detector != ORACLE:
+            raise UnknownNameError("detector", detector, (ORACLE, *IMAGE_DETECTORS, "package.module:Class"))
         if not 0.0 < self.stage_limit <= 3600.0:
             raise InvalidValueError("stage_limit", self.stage_limit, "more than 0 and at most 3600 seconds")
         for stage, given in self.foreign.items():
@@ -97,9 +97,17 @@ class RunConfig:
             "tracker": self.tracker, "localizer": self.localizer, "detector": self.detector,
             "scene graph": self.scene_graph,
         }  # fmt: skip
-        if is_image_detector(self.detector):
+        if self.detector is not None and is_image_detector(self.detector):
             del given["detector"]
         return {stage: name for stage, name in given.items() if name is not None and name != ORACLE}
+
+    @property
+    def detector_choice(self) -> DetectorChoice:
+        """The detector that finds objects, and why it is this one."""
+        if self.detector is not None:
+            return DetectorChoice(self.detector, "it was asked for")
+        classes = {thing.model for thing in self.scene.objects}
+        return choose_detector(classes, self.oracle != OracleDetectorConfig())
 
     @property
     def agent_name(self) -> str:
@@ -113,7 +121,8 @@ class RunConfig:
             "seed": self.seed,
             "duration": self.seconds,
             "agent": self.agent_name,
-            "detector": self.detector,
+            "detector": self.detector_choice.name,
+            "detector_reason": self.detector_choice.reason,
             "tracker": self.tracker,
             "localizer": self.localizer,
             "scene_graph": self.scene_graph,

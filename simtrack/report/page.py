@@ -75,7 +75,7 @@ def render(record: RunRecord) -> str:
     """The report as HTML."""
     page = template("template.html")
     colors = class_colors([f.class_name for f in record.object_frames] + list(record.meshes))
-    targets = targets_of(record.scene)
+    targets = targets_of(record.scene, str(record.config.get("detector")))
     layers, answers = ([], [])
     if record.query_frame is not None:
         layers, answers = query_layers(record.query_frame, record.meshes)
@@ -112,7 +112,9 @@ def _stages(config: Mapping[str, object]) -> str:
     """Whose stages were measured, in words."""
     given = [(stage.replace("_", " "), config.get(stage)) for stage in ("tracker", "localizer", "scene_graph")]
     foreign = [f"{stage} {name}" for stage, name in given if name]
-    return " · ".join([*(foreign or ["simtrack's stages"]), f"detector {config.get('detector', 'of the recording')}"])
+    reason = f" ({config['detector_reason']})" if "detector_reason" in config else ""
+    detector = f"detector {config.get('detector', 'of the recording')}{reason}"
+    return " · ".join([*(foreign or ["simtrack's stages"]), detector])
 
 
 def _missed(metrics: Mapping[str, Metric]) -> list[str]:

@@ -41,7 +41,8 @@ def folder(tmp_path_factory) -> Path:
     """A short run with a log of its feed beside it."""
     path = tmp_path_factory.mktemp("runs") / "first"
     log = path.with_suffix(".mcap")
-    command("run", "--duration", SECONDS, "--renderer", "embree", "--out", path, "--log", log)
+    said = command("run", "--duration", SECONDS, "--renderer", "embree", "--out", path, "--log", log)
+    assert "detector: keypoints (the networks that come along know all objects of the scene)" in said
     return path
 
 
@@ -56,6 +57,7 @@ def test_folder_is_complete(folder: Path) -> None:
     assert len(lines) == math.floor(SECONDS * 30)
     report = (folder / "report.html").read_text()
     assert "workbench" in report
+    assert "detector keypoints (the networks that come along know all objects" in report
     assert "Partial" not in report
 
 
@@ -138,7 +140,8 @@ def test_conditions_reach_the_scene_and_are_refused_if_unknown(tmp_path: Path) -
     short = "--duration", "0.1", "--renderer", "embree", "--out", tmp_path / "run"
     command("run", "workbench", "--given", "noise=0,latency=0.25", *short)
     config = yaml.safe_load((tmp_path / "run" / "config.yaml").read_text(encoding="utf-8"))
-    assert config["oracle"]["latency"] == 0.25
+    assert (config["detector"], config["oracle"]["latency"]) == ("oracle", 0.25)
+    assert "conditions" in config["detector_reason"]
     assert config["scene_file"]["sensors"]["lidar_noise"]["sigma"] == 0.0
     told = refused("run", "workbench", "--given", "fog=1")
     assert "fog" in told and "noise" in told
