@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -212,3 +213,22 @@ def test_the_networks_that_come_along_know_the_workbench() -> None:
     assert once.detections == again.detections == ()
     assert sum(path.stat().st_size for path in keypoint_detector.SHIPPED.glob("*.onnx")) < 12_000_000
     check_image_detector("keypoints")
+
+
+@pytest.mark.skipif(find_spec("openvino") is None, reason="OpenVINO is not installed (extra openvino)")
+@pytest.mark.parametrize("file", [keypoint_detector.BOXES, keypoint_detector.KEYPOINTS])
+def test_openvino_answers_as_onnxruntime_does(file: str) -> None:
+    """As near as 16-bit arithmetic allows, which OpenVINO takes where the processor has it."""
+    rng = np.random.default_rng(0)
+    ours, theirs = (open_network(keypoint_detector.SHIPPED / file, name) for name in ("onnxruntime", "openvino"))
+    assert (ours.runtime, theirs.runtime) == ("onnxruntime", "openvino")
+    assert (ours.inputs, ours.outputs, ours.metadata) == (theirs.inputs, theirs.outputs, theirs.metadata)
+    free = 2  # of sizes that are not fixed
+    given = {
+        name: rng.standard_normal([n if isinstance(n, int) else free for n in shape]).astype(np.float32)
+        for name, shape in ours.inputs.items()
+    }
+    for a, b in zip(ours.run(given), theirs.run(given), strict=True):
+        assert a.shape == b.shape
+        assert a.dtype == b.dtype
+        assert np.abs(a - b).max() < 0.1 * a.std()
