@@ -135,11 +135,9 @@ def _some(source: Source, count: int | None) -> Iterator[tuple[int, int, Labelle
 def _score(scores: DetectorScores, steps: "_PoseSteps", detector: KeypointDetector, image: LabelledImage) -> None:
     frame = RgbdFrame(0, image.depth, image.rgb, image.intrinsics, np.eye(4))
     began = process_time()
-    boxes = detector.boxes(image.rgb, image.depth, LEAST_SCORE)
-    taken = [box for box in boxes if box.score >= detector.config.box_score]
-    detections = detector.keypoints(taken, image.rgb, image.depth, image.intrinsics.fx)
+    detections = detector.detect(frame).detections
     scores.seconds.append(process_time() - began)
-    scores.found.append(boxes)
+    scores.found.append(detector.boxes(image.rgb, image.depth, LEAST_SCORE))
     labels = image.labels
     scores.there.append(
         (

@@ -1,19 +1,17 @@
 """Figures of a detector whose errors are known."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from simtrack.contracts import Detection
+from simtrack.contracts import Detection, DetectionResult, RgbdFrame
 from simtrack.evaluation import detector as evaluation
 from simtrack.evaluation.detector import evaluate_detector, nearest_alike, write_scores
 from simtrack.objects import load_object
 from simtrack.perception.detection.boxes import Box
-from simtrack.perception.detection.keypoint_detector import KeypointDetectorConfig
 from simtrack.perception.detection.pnp import project_points
 from simtrack.training.source import Label, LabelledImage, Source
 from tests.perception.tracking.scenes import INTRINSICS, BenchWorld, in_camera, on_bench
@@ -27,13 +25,11 @@ class Known:
     def __init__(self, boxes: list[Box], detections: list[Detection]) -> None:
         self._boxes, self._detections = boxes, detections
 
-        self.config = KeypointDetectorConfig()
-
     def boxes(self, rgb: np.ndarray, depth: np.ndarray, least_score: float) -> list[Box]:
         return self._boxes
 
-    def keypoints(self, boxes: Sequence[Box], *image: Any) -> tuple[Detection, ...]:
-        return tuple(self._detections)
+    def detect(self, frame: RgbdFrame) -> DetectionResult:
+        return DetectionResult(frame.stamp, frame.stamp, tuple(self._detections))
 
 
 @pytest.fixture(scope="module")

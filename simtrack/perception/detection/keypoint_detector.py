@@ -54,14 +54,16 @@ class KeypointDetectorConfig:
     """Seconds of simulated or recorded time from the image's stamp to the answer. The next image is taken then."""
     box_score: float = 0.4
     """Boxes with a lower score are not looked at."""
-    present: float = 0.95
+    present: float = 0.98
     """Windows in which the object is with less probability than this are dropped."""
     hint: float = 0.2
     """Boxes with at least this score are looked at, too, and regions that nothing explains with such a centre ..."""
     hints: int = 12
-    """... at most so many, those with the highest scores; they are dropped ..."""
-    hint_present: float = 0.99
-    """... if the object is there with less probability than this."""
+    """... at most so many, those with the highest scores, which are dropped ..."""
+    weak_present: float = 0.999
+    """... if the object is in the box with less probability than this ..."""
+    region_present: float = 0.99
+    """... or in the region with less than this."""
     same: float = 0.25
     """Objects of a class whose centres are nearer to each other than this are the same, in shares of a box's side."""
     max_sigma: float = 0.3
@@ -126,17 +128,22 @@ class KeypointDetector:
         available = frame.stamp + int(self.config.latency * NANOSECONDS)
         if frame.rgb is None:
             return DetectionResult(frame.stamp, available, (), Status.NO_DATA)
+        config = self.config
         heat, sides, scale = self._look(frame.rgb, frame.depth)
-        boxes = self._decoded(heat, sides, scale, min(self.config.hint, self.config.box_score))
-        clear = [box for box in boxes if box.score > self.config.box_score]
+        boxes = self._decoded(heat, sides, scale, min(config.hint, config.box_score))
+        clear = [(box, config.present) for box in boxes if box.score > config.box_score]
         unexplained = [region.box for region in regions if region.sensor == "camera"]
-        hints = boxes[len(clear) :] + boxes_of_regions(heat, unexplained, scale, self.config.hint)
-        hints = sorted((b for b in hints if self._diameters[b.class_index]), key=lambda b: -b.score)[
-            : self.config.hints
+        hints = [(box, config.weak_present) for box in boxes[len(clear) :]]
+        hints += [
+            (box, config.region_present)
+            for box in boxes_of_regions(heat, unexplained, scale, config.hint)
+            if self._diameters[box.class_index]
         ]
-        image = frame.rgb, frame.depth, frame.intrinsics.fx
-        found = self.keypoints(clear, *image)
-        further = self.keypoints(hints, *image, least_present=self.config.hint_present)
+        looked = clear + sorted(hints, key=lambda hint: -hint[0].score)[: config.hints]
+        answers = self._closer([box for box, _ in looked], frame.rgb, frame.depth, frame.intrinsics.fx)
+        sure = [there >= least for (_, there), (_, least) in zip(answers, looked, strict=True)]
+        found = [answers[k][0] for k in range(len(clear)) if sure[k]]
+        further = [answers[k][0] for k in range(len(clear), len(looked)) if sure[k]]
         return DetectionResult(frame.stamp, available, (*found, *self._unlike(further, found)))
 
     def _unlike(self, further: Sequence[Detection], found: Sequence[Detection]) -> list[Detection]:
@@ -169,9 +176,7 @@ class KeypointDetector:
         wanted = (box for box in decoded_boxes(heat, sides, least_score) if self._diameters[box.class_index])
         return [Box(box.class_index, (box.corners + 0.5) * scale - 0.5, box.score) for box in wanted]
 
-    def keypoints(
-        self, boxes: Sequence[Box], rgb: Uint8, depth: Float32, focal: float, least_present: float | None = None
-    ) -> tuple[Detection, ...]:
+    def keypoints(self, boxes: Sequence[Box], rgb: Uint8, depth: Float32, focal: float) -> tuple[Detection, ...]:
         """Look closer at boxes.
 
         Args:
@@ -179,11 +184,14 @@ class KeypointDetector:
             rgb: (H, W, 3).
             depth: (H, W), metres, 0 = no reading.
             focal: length in pixels.
-            least_present: least probability, 0 to 1; the configured one if None.
         """
+        answers = self._closer(boxes, rgb, depth, focal)
+        return tuple(detection for detection, there in answers if there >= self.config.present)
+
+    def _closer(self, boxes: Sequence[Box], rgb: Uint8, depth: Float32, focal: float) -> list[tuple[Detection, float]]:
+        """What is in boxes, and the probability that it is there."""
         if not boxes:
-            return ()
-        least_present = self.config.present if least_present is None else least_present
+            return []
         pyramid, size = Pyramid(rgb), self._window
         windows = [window_about(box.corners) for box in boxes]
         shown, told = [], []
@@ -198,7 +206,7 @@ class KeypointDetector:
         places, spreads = decoded(coordinates)
         there = 1.0 / (1.0 + np.exp(-present.astype(float)))
         answers = zip(boxes, windows, places, spreads, there.tolist(), strict=True)
-        return tuple(self._detection(*answer) for answer in answers if answer[4] >= least_present)
+        return [(self._detection(*answer), answer[4]) for answer in answers]
 
     def _detection(self, box: Box, window: Window, places: Float64, spreads: Float64, there: float) -> Detection:
         first = np.array([window.u, window.v]) - 0.5 * window.side

@@ -129,10 +129,10 @@ def region(box: np.ndarray, sensor: str = "camera") -> RegionOfInterest:
 def test_weak_centres_want_surer_windows(opened: dict[str, Any]) -> None:
     answers, image = opened["answers"]["instance"], frame(np.zeros((480, 640, 3), np.uint8))
     for centre, present, count in (
-        (4.0, 3.5, 1),  # scores of 0.98 and 0.97
-        (-1.2, 3.5, 0),  # 0.23
-        (-1.2, 6.0, 1),  # the window 0.998
-        (-2.0, 6.0, 0),  # 0.12
+        (4.0, 4.5, 1),  # scores of 0.98 and 0.989
+        (-1.2, 6.0, 0),  # 0.23 and 0.998
+        (-1.2, 8.0, 1),  # 0.9997
+        (-2.0, 8.0, 0),  # 0.12
     ):
         answers.centre, answers.present = centre, present
         assert len(KeypointDetector(models(), Path("x")).detect(image).detections) == count
@@ -150,7 +150,7 @@ def test_regions_that_nothing_explains_have_windows_of_their_own(opened: dict[st
     assert len(detector.detect(image, [region(beside, "lidar")]).detections) == 1
     none = KeypointDetector(models(), Path("x"), KeypointDetectorConfig(hints=0))
     assert len(none.detect(image, [region(beside)]).detections) == 1
-    answers.present = 3.5
+    answers.present = 4.5
     assert len(detector.detect(image, [region(beside)]).detections) == 1
 
 
