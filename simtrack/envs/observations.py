@@ -38,6 +38,7 @@ from simtrack.geometry.transforms import (
 )
 from simtrack.objects.tiago import CAMERA, HEAD_PAN, HEAD_TILT, TORSO
 from simtrack.perception.scene_graph import RELATIONS
+from simtrack.perception.scene_graph.history import about
 
 Arrays: TypeAlias = dict[str, np.ndarray]
 
@@ -222,10 +223,10 @@ class Encoder:
     def _relate(self, out: Arrays, belief: Belief, kept: Sequence[tuple[int, Track]]) -> None:
         rows = {graph_name(track): slot for slot, track in kept}
         columns = rows | self._furniture
-        for relation in belief.relations:
-            if relation.subject in rows and relation.reference in columns:
-                at = rows[relation.subject], columns[relation.reference], self._relation[relation.name]
-                out["relations"][at] = 1
+        for subject, row in rows.items():
+            for relation in about(belief.relations, subject):
+                if relation.reference in columns:
+                    out["relations"][row, columns[relation.reference], self._relation[relation.name]] = 1
 
     def _articulate(self, out: Arrays, belief: Belief) -> None:
         if not self.layout.articulations:

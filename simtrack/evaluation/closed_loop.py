@@ -41,6 +41,7 @@ from simtrack.objects import ObjectModel
 from simtrack.perception.detection.loading import make_image_detector
 from simtrack.perception.foreign import StageContext, Watch
 from simtrack.perception.pipeline import PerceptionStack
+from simtrack.perception.scene_graph.history import about
 from simtrack.perception.tracking.tracker import ObjectTracker
 from simtrack.simulation.agents import AgentContext, make_agent
 from simtrack.simulation.oracles import OracleDetector, OracleLocalizer
@@ -273,7 +274,8 @@ class ClosedLoopRun:
 
     def _remember(self, belief: Belief) -> None:
         tracked = {graph_name(track) for track in belief.tracks}
-        self._timeline.observe(belief.stamp, frozenset(r for r in belief.relations if r.subject in tracked))
+        held = frozenset(relation for name in tracked for relation in about(belief.relations, name))
+        self._timeline.observe(belief.stamp, held)
         for stage, seconds in belief.stage_seconds.items():
             self._stages[stage].append(seconds)
         self.on_progress(self._progress(self.config.agent_name, belief))

@@ -21,6 +21,7 @@ from simtrack.contracts import (
 from simtrack.evaluation.metrics import Metrics
 from simtrack.evaluation.tracking import VISIBLE, ObjectFrame
 from simtrack.geometry.meshes import Mesh
+from simtrack.perception.scene_graph.history import about
 
 KEY_FRAMES, WORST_MOMENTS = 6, 4
 WORST_APART = 1.0
@@ -245,9 +246,10 @@ def _query_score(belief: Belief) -> float:
     """How much there is to show of `on` and `left-of` between tracks that are well seen."""
     seen = {graph_name(t) for t in belief.tracks if t.believed and t.visible_fraction > 0.5}
     counts: defaultdict[tuple[str, str], int] = defaultdict(int)
-    for relation in belief.relations:
-        if relation.name in ("on", "left-of") and relation.subject in seen and relation.reference in seen:
-            counts[relation.name, relation.reference] += 1
+    for subject in seen:
+        for relation in about(belief.relations, subject):
+            if relation.name in ("on", "left-of") and relation.reference in seen:
+                counts[relation.name, relation.reference] += 1
     on = max((n for (name, _), n in counts.items() if name == "on"), default=0)
     left = max((n for (name, _), n in counts.items() if name == "left-of"), default=0)
     return 3.0 * min(on, 2) + min(left, 3) + 0.1 * len(seen) * (on + left > 0)

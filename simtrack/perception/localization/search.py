@@ -161,14 +161,9 @@ def _coarse_cells(search_map: SearchMap, config: SearchConfig, window: tuple[Flo
 
 def _distinct(cells: Float64, score: Float64, search_map: SearchMap, config: SearchConfig) -> SearchResult:
     """The maxima that differ by more than half a metre or 15 degrees."""
-    left = np.argsort(-score, kind="stable")
-    chosen: list[int] = []
-    while len(left) and len(chosen) < config.modes:
-        best = int(left[0])
-        chosen.append(best)
-        turn = np.abs((cells[left, 2] - cells[best, 2] + np.pi) % (2 * np.pi) - np.pi)
-        far = np.abs(cells[left, :2] - cells[best, :2]).max(axis=1) > 0.5
-        left = left[far | (turn > 0.26)]
+    from simtrack.perception.localization.search_kernels import distinct
+
+    chosen = distinct(cells, np.argsort(-score, kind="stable"), config.modes, 0.5, 0.26)
     poses = np.stack([transform_planar(*cells[k]) for k in chosen])
     poses[:, 2, 3] = search_map.floor
     return SearchResult(poses, score[chosen])

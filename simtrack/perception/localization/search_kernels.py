@@ -90,7 +90,7 @@ def bound_cells(
     """
     count = points.shape[0]
     out = np.empty(cells.shape[0])
-    side, offset = np.empty(count), np.empty(count, np.int64)
+    scale, offset = np.empty(count), np.empty(count, np.int64)
     width, height = np.empty(count, np.int64), np.empty(count, np.int64)
     top = shapes.shape[0] - 1
     for i in range(count):
@@ -99,7 +99,7 @@ def bound_cells(
         level = 0
         while level < top and move > (0.0 if level == 0 else resolution * 2.0 ** (level - 1)):
             level += 1
-        side[i] = resolution * (1.0 if level == 0 else 2.0 ** (level - 1))
+        scale[i] = 1.0 / (resolution * (1.0 if level == 0 else 2.0 ** (level - 1)))
         width[i], height[i] = shapes[level, 1], shapes[level, 2]
         offset[i] = offsets[level] + layers[i] * width[i] * height[i]
     for c in nb.prange(cells.shape[0]):
@@ -107,10 +107,10 @@ def bound_cells(
         x0, y0 = cells[c, 0] - origin[0], cells[c, 1] - origin[1]
         total = 0
         for i in range(count):
-            x = int(np.floor((x0 + cosine * points[i, 0] - sine * points[i, 1]) / side[i]))
-            y = int(np.floor((y0 + sine * points[i, 0] + cosine * points[i, 1]) / side[i]))
-            if 0 <= x < width[i] and 0 <= y < height[i]:
-                total += field[offset[i] + x * height[i] + y]
+            x = (x0 + cosine * points[i, 0] - sine * points[i, 1]) * scale[i]
+            y = (y0 + sine * points[i, 0] + cosine * points[i, 1]) * scale[i]
+            if 0.0 <= x < width[i] and 0.0 <= y < height[i]:
+                total += field[offset[i] + int(x) * height[i] + int(y)]
         out[c] = total / (255.0 * count)
     return out
 
@@ -125,3 +125,28 @@ def expand_cells(cells: Float64, cell: float, step: float) -> Float64:
             out[8 * c + k, 1] = cells[c, 1] + (0.25 if k & 2 else -0.25) * cell
             out[8 * c + k, 2] = cells[c, 2] + (0.25 if k & 4 else -0.25) * step
     return out
+
+
+@nb.njit(cache=True, nogil=True)
+def distinct(cells: Float64, order: np.ndarray, count: int, distance: float, turn: float) -> np.ndarray:
+    """Up to `count` of the pose cells (C, 3), in `order` (C,), each apart from those before by one of the limits.
+
+    `distance` in metres along x or y, `turn` in radians.
+    """
+    chosen = np.empty(count, np.int64)
+    found = 0
+    for c in order:
+        alike = False
+        for k in range(found):
+            other = chosen[k]
+            yaw = abs((cells[c, 2] - cells[other, 2] + np.pi) % (2 * np.pi) - np.pi)
+            away = max(abs(cells[c, 0] - cells[other, 0]), abs(cells[c, 1] - cells[other, 1]))
+            if away <= distance and yaw <= turn:
+                alike = True
+                break
+        if not alike:
+            chosen[found] = c
+            found += 1
+            if found == count:
+                break
+    return chosen[:found]

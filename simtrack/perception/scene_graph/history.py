@@ -50,6 +50,10 @@ class RelationSet(Set[Relation]):
     def __len__(self) -> int:
         return self._size
 
+    def about(self, subject: str) -> list[Relation]:
+        """Those of one subject; takes as long as it has ever had relations, however many others there are."""
+        return [relation for relation in self._history.ever_about(subject) if relation in self]
+
     def __repr__(self) -> str:
         return f"<{self._size} relations at {self._stamp} ns>"
 
@@ -66,11 +70,14 @@ class History:
 
     def __init__(self, intervals: Mapping[Relation, Iterable[Interval]] | None = None) -> None:
         self._intervals: dict[Relation, list[Interval]] = {}
+        self._about: dict[str, dict[Relation, None]] = {}
+        """Subject -> what has ever held of it, in the order in which it began."""
         self._current: set[Relation] = set()
         self._frozen: frozenset[Relation] | None = None
         self.events: list[Event] = []
         for relation, spans in (intervals or {}).items():
             self._intervals[relation] = list(spans)
+            self._about.setdefault(relation.subject, {})[relation] = None
             for begin, end in self._intervals[relation]:
                 self.events.append(Event(begin, relation, True))
                 if end is None:
@@ -98,6 +105,7 @@ class History:
         self._current.add(relation)
         self._frozen = None
         spans = self._intervals.setdefault(relation, [])
+        self._about.setdefault(relation.subject, {})[relation] = None
         if spans and spans[-1].end == stamp:
             spans[-1] = Interval(spans[-1].begin, None)
             self._forget(Event(stamp, relation, False))
@@ -122,7 +130,7 @@ class History:
             spans.append(Interval(begin, stamp))
             self.events.append(Event(stamp, relation, False))
         if not spans:
-            del self._intervals[relation]
+            del self._intervals[relation], self._about[relation.subject][relation]
 
     def _forget(self, event: Event) -> None:
         """Strike out an event of the present stamp, one of the last."""
@@ -134,6 +142,10 @@ class History:
     def intervals(self, relation: Relation) -> tuple[Interval, ...]:
         """Intervals during which a relation held, earliest first; empty if it never did."""
         return tuple(self._intervals.get(relation, ()))
+
+    def ever_about(self, subject: str) -> Iterable[Relation]:
+        """What has held of a subject at any time."""
+        return self._about.get(subject, ())
 
     def held(self, relation: Relation, stamp: int) -> bool:
         """Whether a relation held at `stamp`, nanoseconds."""
@@ -152,3 +164,10 @@ class History:
 
     def __len__(self) -> int:
         return len(self._intervals)
+
+
+def about(relations: Set[Relation], subject: str) -> list[Relation]:
+    """Those of some relations that have a subject; fast for what a history tells."""
+    if isinstance(relations, RelationSet):
+        return relations.about(subject)
+    return [relation for relation in relations if relation.subject == subject]

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simtrack.contracts import Relation
-from simtrack.perception.scene_graph.history import History, RelationSet
+from simtrack.perception.scene_graph.history import History, RelationSet, about
 
 NAMES = ("a", "b", "c")
 relations = st.builds(Relation, st.sampled_from(NAMES), st.sampled_from(["on", "near"]), st.sampled_from(NAMES))
@@ -35,6 +35,8 @@ def test_what_held_stays_as_it_was_while_the_history_goes_on(updates: list[list[
         assert expected == current
         assert set(current) == expected
         assert len(current) == len(expected)
+        for name in NAMES:
+            assert set(about(current, name)) == set(about(expected, name)) == {r for r in expected if r.subject == name}
         assert all((Relation(s, name, r) in current) == (Relation(s, name, r) in expected)
                    for s in NAMES for name in ("on", "near") for r in NAMES)  # fmt: skip
 
