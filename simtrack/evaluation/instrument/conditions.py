@@ -33,7 +33,7 @@ _LIDAR, _ENCODERS = ("sigma", "resolution", "dropout"), ("sigma", "resolution")
 _ODOMETRY = ("travel_from_travel", "travel_from_turn", "turn_from_travel", "turn_from_turn")
 """Variances: they grow with the square of the factor."""
 _SHARES = ("dropout", "flying_pixels")
-_DETECTOR_ERRORS = ("keypoint_error", "miss_rate", "false_positive_rate", "wrong_class_rate")
+_DETECTOR_ERRORS = ("keypoint_error", "miss_rate", "hard_misses", "false_positive_rate", "wrong_class_rate")
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,7 +85,7 @@ def test_the_hand_is_faster_within_what_it_can(scene) -> None:
 
 def test_a_perfect_detector_is_still_late() -> None:
     perfect = Conditions(detection=0.0).detector(OracleDetectorConfig())
-    assert perfect.keypoint_error == perfect.miss_rate == perfect.false_positive_rate == 0.0
+    assert perfect.keypoint_error == perfect.miss_rate == perfect.hard_misses == perfect.false_positive_rate == 0.0
     assert perfect.latency == OracleDetectorConfig().latency
     assert Conditions(latency=0.0).detector(OracleDetectorConfig()).latency == 0.0
 

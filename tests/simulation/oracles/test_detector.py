@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -52,30 +52,52 @@ def _true_detections(detector: OracleDetector, count: int):
     return [[d for d in detector.detect(f).detections if d.class_name == "relay"] for f in _frames(count)]
 
 
+SIZE = K.fx * MODELS["relay"].diameter / T[2, 3]
+"""Pixels, of the relay in the image."""
+
+
 def test_errors_are_as_large_and_as_frequent_as_configured() -> None:
-    config = OracleDetectorConfig(false_positive_rate=0.0, wrong_class_rate=0.0)
+    config = OracleDetectorConfig(miss_rate=0.1, correlation=0.5, false_positive_rate=0.0, wrong_class_rate=0.0)
     answers = _true_detections(OracleDetector(World(), MODELS, 3, config), 600)
     found = [d[0] for d in answers if d]
-    assert abs(len(found) / 600 - 0.9) < 0.04
+    assert abs(len(found) / 600 - 0.9 * (1.0 - (config.min_size / SIZE) ** 2)) < 0.04
     truth = project_points(T, MODELS["relay"].keypoints, K)
-    size = K.fx * MODELS["relay"].diameter / T[2, 3]
     errors = np.stack([d.keypoints - truth for d in found])
-    share = np.median(np.linalg.norm(errors, axis=2)) / size
-    assert abs(share - 0.04) < 0.006
+    share = np.median(np.linalg.norm(errors, axis=2)) / SIZE
+    assert abs(share - config.keypoint_error) < 0.15 * config.keypoint_error
     within = np.var(errors - errors.mean(axis=1, keepdims=True))
     assert within < 0.95 * np.var(errors)  # part of the error is common to a detection
+    told = np.stack([d.keypoint_sigma for d in found])
+    assert abs(np.std(np.log(told[:, 0])) - config.spread) < 0.08
+    assert abs(np.mean((errors / told[:, :, None]) ** 2) - 1.0) < 0.1  # each detection tells its own
 
 
-def test_occlusion_hides_and_blurs() -> None:
+def test_misses_and_errors_grow_with_occlusion_as_those_of_the_networks() -> None:
+    """Measured on 4049 objects: visible share, share that the networks missed, error in shares of the size."""
+    measured = ((0.85, 0.028, 0.035), (0.65, 0.133, 0.0588), (0.45, 0.281, 0.1053), (0.25, 0.567, 0.1529))
+    truth = project_points(T, MODELS["relay"].keypoints, K)
+    for visible, missed, error in measured:
+        config = OracleDetectorConfig(false_positive_rate=0.0, wrong_class_rate=0.0, min_size=1.0)
+        answers = _true_detections(OracleDetector(World(visible), MODELS, 3, config), 500)
+        found = [d[0].keypoints for d in answers if d]
+        assert abs(1.0 - len(found) / 500 - missed) < 0.07
+        distances = np.linalg.norm(np.stack(found) - truth, axis=2) / SIZE
+        assert 0.75 < np.median(distances) / error < 1.33
+
+
+def test_what_is_hidden_or_far_away_is_not_found() -> None:
     config = OracleDetectorConfig(false_positive_rate=0.0, wrong_class_rate=0.0)
-    clear, half, hidden = (_true_detections(OracleDetector(World(v), MODELS, 3, config), 300) for v in (1.0, 0.3, 0.1))
-    counts = [sum(len(d) for d in answers) for answers in (clear, half, hidden)]
-    assert counts[0] > counts[1] > counts[2] == 0
-    assert half[next(i for i, d in enumerate(half) if d)][0].keypoint_sigma[0] > clear[0][0].keypoint_sigma[0]
+    for world, settings in ((World(0.05), config), (World(), replace(config, min_size=1.01 * SIZE))):
+        assert not any(_true_detections(OracleDetector(world, MODELS, 3, settings), 100))
+
+
+def test_a_detector_without_misses_finds_what_it_may() -> None:
+    config = OracleDetectorConfig(miss_rate=0.0, hard_misses=0.0, false_positive_rate=0.0, wrong_class_rate=0.0)
+    assert all(_true_detections(OracleDetector(World(0.2), MODELS, 3, config), 100))
 
 
 def test_false_positives_and_wrong_classes() -> None:
-    config = OracleDetectorConfig(miss_rate=0.0, false_positive_rate=0.2, wrong_class_rate=0.3)
+    config = OracleDetectorConfig(miss_rate=0.0, hard_misses=0.0, false_positive_rate=0.2, wrong_class_rate=0.3)
     detector = OracleDetector(World(), MODELS, 3, config)
     answers = [detector.detect(f).detections for f in _frames(400)]
     assert abs(np.mean([len(a) for a in answers]) - 1.2) < 0.07
