@@ -152,6 +152,18 @@ def test_the_first_track_is_waited_for_while_the_object_can_be_seen(world, score
     assert first_track_times(world, scorers, visible, tracked) == (1, pytest.approx(0.4))
 
 
+def test_who_is_too_far_away_for_the_camera_waits_for_no_track(world, scorers) -> None:
+    evaluator = TrackingEvaluator(scorers)
+    near = world.poses["meter"].copy()
+    for k in range(30):
+        world.poses["meter"] = near.copy()
+        if k < 12:
+            world.poses["meter"][:3, 3] += (0.0, 0.0, 10.0)
+        tracks = [world.track("meter", 1, k * TENTH)] if k >= 16 else []
+        evaluator.observe(tracks, world.truth(k * TENTH), {"meter": 1.0})
+    assert values(evaluator)["tracking.first_track_time.max"] == pytest.approx(0.4)
+
+
 def test_a_first_track_is_confirmed_and_in_place(world, scorers) -> None:
     visible, tracked = [0.8] * 16, [True] * 16
     assert first_track_times(world, scorers, visible, tracked) == (1, 0.0)
