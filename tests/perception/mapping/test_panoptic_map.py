@@ -140,6 +140,7 @@ def test_a_mask_inside_a_geometric_segment_is_split_out_of_it() -> None:
     split = fuse_segments(geometric, panoptic, depth, CAMERA)
     assert len(split) == 2 and sorted(split.instances[1:].tolist()) == [1, 2]
     assert split.sizes[split.image[50, 50]] == 800 and split.instances[split.image[50, 50]] == 2
+    assert split.geometric[split.image[0, 0]] and not split.geometric[split.image[50, 50]]
     whole = fuse_segments(geometric, panoptic, depth, CAMERA, config=FrameFusionConfig(split=False))
     assert len(whole) == 1 and whole.instances[1] == 1
 
@@ -379,10 +380,33 @@ def test_thin_things_that_no_geometric_segment_has_are_segments() -> None:
 
 def test_entities_that_few_frames_speak_for_are_dropped() -> None:
     frame, T, segments = views(1)[0]
-    panoptic_map = PanopticMap(PanopticMapConfig.of_method("full", 0.03))
-    for expected in (0, 0, 2):
-        assert panoptic_map.integrate(frame, T, segments).status is Status.OK
-        assert len(panoptic_map.entities()) == expected
+    for rate, least in ((1.0, 3), (4.0, 6)):
+        panoptic_map = PanopticMap(PanopticMapConfig.of_method("full", 0.03))
+        for number in range(1, least + 2):
+            shown = replace(frame, stamp=round(number / rate * NANOSECONDS))
+            assert panoptic_map.integrate(shown, T, segments).status is Status.OK
+            # The floor is stuff; the box must have been told for 1.6 s, and by three frames.
+            enough = number >= max(3, round(1.6 * number / max((number - 1) / rate, 1e-9)))
+            assert len(panoptic_map.entities()) == 1 + enough, number
+
+
+@pytest.mark.parametrize("method", ["no-joint-fusion", "voxbloxpp"])
+def test_baselines_take_what_their_counts_say_for_entities(method: Method) -> None:
+    frame, T, segments = views(1)[0]
+    panoptic_map = PanopticMap(PanopticMapConfig.of_method(method, 0.03))
+    assert panoptic_map.integrate(frame, T, segments).status is Status.OK
+    assert [e.semantic_class for e in panoptic_map.entities()] == ["floor", "box"]
+
+
+def test_segments_that_masks_made_do_not_say_that_labels_are_one() -> None:
+    frame, T, _ = views(1)[0]
+    halves = np.where(np.arange(160) < 80, 1, 2).astype(np.int32) * np.ones((120, 1), np.int32)
+    whole = PanopticSegments(0, np.ones((120, 160), np.int32), ("floor",), np.ones(1, np.float32))
+    for across, labels in ((np.zeros_like(halves), 2), (np.ones_like(halves), 1)):
+        panoptic_map = PanopticMap(PanopticMapConfig.of_method("no-joint-fusion", 0.03))
+        for geometric in (*[halves] * 8, *[across] * 6):
+            assert panoptic_map.integrate(frame, T, whole, geometric).status is Status.OK
+        assert len(np.unique(panoptic_map.labels.canonical[1:3])) == labels
 
 
 def test_what_is_cut_off_from_a_thing_says_nothing_or_background() -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtrack.contracts import CameraIntrinsics, Float32, Float64, Int32
+from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, Int32
 from simtrack.errors import InvalidValueError
 from simtrack.perception.segmentation.panoptic import PanopticSegments
 
@@ -83,6 +83,8 @@ class FrameSegments:
     entry 0 is not a segment."""
     sizes: Int32
     """(N + 1,): readings."""
+    geometric: Bool
+    """(N + 1,): whether depth alone drew it; else a mask did, wherever that leaks to."""
 
     def __len__(self) -> int:
         return len(self.instances) - 1
@@ -126,7 +128,7 @@ def fuse_segments(
     numbers = np.where(sizes > 0, np.cumsum(sizes > 0), 0).astype(np.int32)
     image = np.where(read, numbers[table].ravel()[pairs], 0).astype(np.int32)
     kept = np.concatenate([[0], np.flatnonzero(sizes > 0)])
-    segments = FrameSegments(image, instances[kept], sizes[kept])
+    segments = FrameSegments(image, instances[kept], sizes[kept], kept < len(joint))
     if config.fill and masks:
         segments = _filled(segments, panoptic.image, depth, config.step, least)
     if config.cluster and masks:
@@ -178,7 +180,8 @@ def _filled(segments: FrameSegments, masks: Int32, depth: Float32, step: float, 
     instances = np.concatenate([segments.instances, more]).astype(np.int32)
     sizes = np.bincount(image.ravel(), minlength=len(instances)).astype(np.int32)
     sizes[0] = 0
-    return FrameSegments(image, instances, sizes)
+    geometric = np.concatenate([segments.geometric, np.zeros(len(more), np.bool_)])
+    return FrameSegments(image, instances, sizes, geometric)
 
 
 def _extracted(joint: np.ndarray, least: int, config: FrameFusionConfig) -> np.ndarray:

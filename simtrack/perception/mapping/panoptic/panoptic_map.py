@@ -67,15 +67,18 @@ class PanopticMapConfig:
     def of_method(method: Method, voxel: float = 0.02) -> "PanopticMapConfig":
         """The settings of a method of the reconstruction paper's Table 2.
 
-        ``full``; ``no-joint-fusion``, the ablation, which counts classes and instances separately; ``voxbloxpp``, which
-        besides neither splits nor clusters the segments of a frame.
+        ``full``; ``no-joint-fusion``, the ablation, which counts classes and instances separately, and takes what its
+        counts say for the entities, as both papers do; ``voxbloxpp``, which besides neither splits nor clusters the
+        segments of a frame.
 
         Raises:
             InvalidValueError: no such method.
         """
         if method not in METHODS:
             raise InvalidValueError("method", method, ", ".join(METHODS))
-        config = PanopticMapConfig(volume=VolumeConfig(voxel=voxel), joint=method == "full")
+        config = PanopticMapConfig(volume=VolumeConfig(voxel=voxel))
+        if method != "full":
+            config = replace(config, joint=False, entities=EntityConfig.of_counts_alone())
         if method == "voxbloxpp":
             config = replace(config, fusion=FrameFusionConfig(split=False, fill=False, cluster=False, flat=False))
         return config
@@ -113,6 +116,8 @@ class PanopticMap:
         self.counts: PanopticCounts = counts(self.config.counts)
         self.frames = 0
         """Frames that were fused."""
+        self.seconds = 0.0
+        """Of film that they were taken from; a pause counts as one second."""
         self.skipped: dict[str, int] = {}
         """Reason -> frames that were not."""
         self._fused: tuple[int, Float64] | None = None
@@ -166,9 +171,11 @@ class PanopticMap:
             blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera)
         except InvalidValueError as error:
             return self._skip(frame, str(error))
+        if self._fused is not None:
+            self.seconds += min(abs(frame.stamp - self._fused[0]) / NANOSECONDS, 1.0)
         self._fused = now
         self.counts.observe(_observations(segments, labels, panoptic))
-        for label, other in self.labels.count_overlaps(met, counts, least):
+        for label, other in self.labels.count_overlaps(met, counts[segments.geometric], least):
             self._merge(label, other)
         self.frames += 1
         if self.frames % self.config.regularize_every == 0:
@@ -179,7 +186,8 @@ class PanopticMap:
         """The entities of the map, stuff first, then things, by class and number."""
         self.complete()
         self.counts.regularize()
-        return extract_entities(self.volume, self.labels.canonical, self.counts.entities(), self.config.entities)
+        rate = self.frames / self.seconds if self.seconds > 0.0 else 0.0
+        return extract_entities(self.volume, self.labels.canonical, self.counts.entities(), self.config.entities, rate)
 
     def close(self) -> None:
         """Remove the files of what was written away."""
