@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -56,6 +56,9 @@ SAVE_PERIOD = 5 * NANOSECONDS
 """Nanoseconds, simulated: metrics and graph are on disk at least this often."""
 WARM_UP = NANOSECONDS
 """Nanoseconds, simulated, that do not count into the speed."""
+UNHURRIED = 3600.0
+"""Seconds of the wall clock that simtrack's own detectors have for an image: they end, and a machine that stands still
+for a while must not change a run. Those of others have their guard."""
 
 
 class Observer(Protocol):
@@ -161,7 +164,7 @@ def closed(config: RunConfig, agent: str) -> Iterator[Loop]:
             simulation.robot,
             foreign.detector or _own_detector(config, simulation),
             T_map_base=simulation.start,
-            config=config.stack,
+            config=replace(config.stack, runner=replace(config.stack.runner, timeout=UNHURRIED)),
             localizer=OracleLocalizer(simulation.truth) if config.localizer == ORACLE else foreign.localizer,
             tracker=foreign.tracker,
             scene_graph=foreign.scene_graph,

@@ -1,15 +1,19 @@
 """Which detector a run has where none is named, and where that is told."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from simtrack.errors import UnknownNameError
+from simtrack.evaluation.closed_loop import closed
 from simtrack.evaluation.detector_choice import ORACLE, choose_detector
 from simtrack.evaluation.run_config import RunConfig
 from simtrack.evaluation.targets import targets_of
 from simtrack.objects.registry import BUILT_IN
+from simtrack.perception.detection.keypoint_detector import KeypointDetector
 from simtrack.perception.detection.loading import KEYPOINTS
+from simtrack.perception.detection.runner import RunnerConfig
 from simtrack.simulation.oracles import OracleDetectorConfig
 from simtrack.simulation.scene_file import load_scene, parse_scene
 
@@ -62,3 +66,13 @@ def test_less_is_asked_of_poses_where_images_are_looked_at() -> None:
     differing = {name: (oracle[name].limit, images[name].limit) for name in oracle if oracle[name] != images[name]}
     assert differing == {"tracking.add_s_auc": (0.93, 0.90)}
     assert targets_of("of_mine", KEYPOINTS) == {}
+
+
+@pytest.mark.slow
+def test_a_slow_machine_does_not_change_a_run() -> None:
+    """The wall clock ends the patience with detectors of others, which have a guard, but not with simtrack's own."""
+    with closed(config(renderer="embree"), "fixed-gaze") as loop:
+        runner = loop.stack.detections
+        assert isinstance(runner._detector, KeypointDetector)
+        assert runner.config.timeout >= 600.0
+        assert replace(runner.config, timeout=RunnerConfig().timeout) == RunnerConfig()
