@@ -62,7 +62,8 @@ def foreign_stages(config: RunConfig, context: StageContext) -> Iterator[Foreign
             localizer = GuardedLocalizer(built, context.T_map_base, limit)
             exits.callback(localizer.close)
         if "detector" in config.foreign:
-            detector = GuardedDetector(cast(Detector, build_stage("detector", config.detector, context)), limit)
+            named = config.foreign["detector"]
+            detector = GuardedDetector(cast(Detector, build_stage("detector", named, context)), limit)
             exits.callback(detector.close)
         if config.scene_graph is not None:
             built = cast(SceneGraphBuilder, build_stage("scene graph", config.scene_graph, context))

@@ -33,9 +33,6 @@ class EntityConfig:
     """... unless it has so much."""
     least_observed: int = 3
     """Observations of one of its segments that must agree on what a thing is; what fewer say is dropped."""
-    least_told: float = 1.6
-    """Seconds of film in which as many frames are taken as must agree likewise, if those are more: what a network gets
-    wrong it goes on getting wrong while the view stays the same, however many frames it is shown."""
     least_area: float = 0.006
     """Square metres; smaller entities are dropped."""
     gap: float = 0.06
@@ -44,9 +41,8 @@ class EntityConfig:
     """Pieces of a thing with less than this share of the area of its largest are dropped: they are other things'."""
 
     def __post_init__(self) -> None:
-        for name in ("least_held", "least_told"):
-            if not 0.0 <= getattr(self, name) < 1e6:
-                raise InvalidValueError(f"EntityConfig.{name}", getattr(self, name), "0 or more")
+        if not 0.0 <= self.least_held < 1e6:
+            raise InvalidValueError("EntityConfig.least_held", self.least_held, "0 or more")
         if not 1 <= self.least_observed <= 1000:
             raise InvalidValueError("EntityConfig.least_observed", self.least_observed, "1 to 1000")
         for name in ("least_weight", "least_area", "gap", "enough_support"):
@@ -59,7 +55,7 @@ class EntityConfig:
     @staticmethod
     def of_counts_alone() -> "EntityConfig":
         """Entities are what the counts say (Eq. 6, and Voxblox++): nothing doubtful is dropped, no part of them."""
-        return EntityConfig(least_held=0.0, least_support=0.0, least_observed=1, least_told=0.0, least_piece=0.0)
+        return EntityConfig(least_held=0.0, least_support=0.0, least_observed=1, least_piece=0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +121,6 @@ def extract_entities(
     canonical: Int32,
     entities: Mapping[int, SegmentEntity],
     config: EntityConfig | None = None,
-    rate: float = 0.0,
 ) -> tuple[MapEntityMesh, ...]:
     """One mesh an entity.
 
@@ -134,16 +129,14 @@ def extract_entities(
         canonical: (L,), what each label was merged into.
         entities: global segment -> class and instance (Eq. 6).
         config: settings, the defaults if None.
-        rate: frames a second of the film.
     """
     config = config or EntityConfig()
-    least = max(config.least_observed, round(config.least_told * rate))
     surface = extract_surface(volume, config.least_weight)
     parts: dict[tuple[str, int], list[SegmentEntity]] = defaultdict(list)
     for each in entities.values():
         parts[each.semantic_class, each.instance].append(each)
     agreeing = {key: max(each.agreeing for each in found) for key, found in parts.items()}
-    sure = {key for key, most in agreeing.items() if key[0] in STUFF_FIRST or most >= least}
+    sure = {key for key, most in agreeing.items() if key[0] in STUFF_FIRST or most >= config.least_observed}
     parts = {key: found for key, found in parts.items() if key in sure}
     entities = {label: each for label, each in entities.items() if (each.semantic_class, each.instance) in sure}
     keys = sorted(parts, key=lambda key: (key[0] not in STUFF_FIRST, *key))

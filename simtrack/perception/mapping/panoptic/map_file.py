@@ -32,7 +32,6 @@ def write_map(panoptic_map: PanopticMap, path: Path) -> None:
         "counts": panoptic_map.counts.state(),
         "together": panoptic_map.labels.state(),
         "frames": panoptic_map.frames,
-        "seconds": panoptic_map.seconds,
         "skipped": panoptic_map.skipped,
     }
     arrays = {**panoptic_map.volume.blocks(), "canonical": panoptic_map.labels.canonical}
@@ -61,7 +60,6 @@ def read_map(path: Path) -> PanopticMap:
         panoptic_map.labels.restore(document["together"])
         panoptic_map.counts.restore(document["counts"])
         panoptic_map.frames = int(document["frames"])
-        panoptic_map.seconds = float(document.get("seconds", 0.0))
         panoptic_map.skipped = {str(reason): int(n) for reason, n in document["skipped"].items()}
     except FileFormatError:
         raise

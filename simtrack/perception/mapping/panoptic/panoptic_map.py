@@ -116,8 +116,6 @@ class PanopticMap:
         self.counts: PanopticCounts = counts(self.config.counts)
         self.frames = 0
         """Frames that were fused."""
-        self.seconds = 0.0
-        """Of film that they were taken from; a pause counts as one second."""
         self.skipped: dict[str, int] = {}
         """Reason -> frames that were not."""
         self._fused: tuple[int, Float64] | None = None
@@ -171,8 +169,6 @@ class PanopticMap:
             blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera)
         except InvalidValueError as error:
             return self._skip(frame, str(error))
-        if self._fused is not None:
-            self.seconds += min(abs(frame.stamp - self._fused[0]) / NANOSECONDS, 1.0)
         self._fused = now
         self.counts.observe(_observations(segments, labels, panoptic))
         for label, other in self.labels.count_overlaps(met, counts[segments.geometric], least):
@@ -186,8 +182,7 @@ class PanopticMap:
         """The entities of the map, stuff first, then things, by class and number."""
         self.complete()
         self.counts.regularize()
-        rate = self.frames / self.seconds if self.seconds > 0.0 else 0.0
-        return extract_entities(self.volume, self.labels.canonical, self.counts.entities(), self.config.entities, rate)
+        return extract_entities(self.volume, self.labels.canonical, self.counts.entities(), self.config.entities)
 
     def close(self) -> None:
         """Remove the files of what was written away."""
