@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit
 
 from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, Int32
+from simtrack.geometry.projection import bounding_rectangle
 
 RAYS = 900
 """About how many rays cover the box of one object's silhouette."""
@@ -36,18 +37,9 @@ def _boxes(corners, poses, camera, width, height, boxes):
     """Pixel boxes and strides (K, 5) u0, v0, columns, rows, stride; no columns without rays. Returns their number."""
     count = 0
     for k in range(corners.shape[0]):
-        T = poses[k]
-        u_low, v_low, u_high, v_high, nearest = np.inf, np.inf, -np.inf, -np.inf, np.inf
-        for p in corners[k]:
-            z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-            nearest = min(nearest, z)
-            if z < 0.05:
-                break
-            u = camera[0] * (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z + camera[2]
-            v = camera[1] * (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z + camera[3]
-            u_low, v_low, u_high, v_high = min(u_low, u), min(v_low, v), max(u_high, u), max(v_high, v)
+        shown, u_low, v_low, u_high, v_high = bounding_rectangle(corners[k], poses[k], camera)
         beside = u_high < -0.5 or v_high < -0.5 or u_low > width - 0.5 or v_low > height - 0.5
-        if nearest < 0.05 or beside:
+        if not shown or beside:
             continue
         stride = max(1, int(np.sqrt((u_high - u_low) * (v_high - v_low) / RAYS)))
         boxes[k, 0], boxes[k, 1], boxes[k, 4] = int(np.floor(u_low)), int(np.floor(v_low)), stride

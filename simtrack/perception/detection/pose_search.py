@@ -154,9 +154,9 @@ class PoseSearch:
             again = poses[slid]
             self._refine(e, shown, again, NARROW_STEPS)
             after, seen = self._judge(e, shown, again)
-            better = np.flatnonzero(slid)[after < before[slid]]
-            chosen = after < before[slid]
-            refined[better], costs[better], support[better] = again[chosen], after[chosen], seen[chosen]
+            better = after < before[slid]
+            rows = np.flatnonzero(slid)[better]
+            refined[rows], costs[rows], support[rows] = again[better], after[better], seen[better]
         return refined, costs, support
 
     def _refine(self, e: Evidence, shown: ShownModel, poses: Float64, steps: Sequence[tuple[float, float]]) -> None:

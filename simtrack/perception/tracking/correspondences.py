@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from simtrack.contracts import Float32, Float64, Int32, Uint8
+from simtrack.geometry.projection import bounding_rectangle
 
 MISS, SUPPORTED, OCCLUDED, MISSING, INVALID = 0, 1, 2, 3, 4
 """What a ray that hits a model says: nothing hit; measured there; something in front; seen through; no reading."""
@@ -121,20 +122,9 @@ def image_windows(corners, poses, camera, size, margin, windows):
     behind the camera.
     """
     for k in range(poses.shape[0]):
-        T = poses[k]
-        u_low, v_low, u_high, v_high = np.inf, np.inf, -np.inf, -np.inf
         windows[k] = 0
-        nearest = np.inf
-        for c in range(8):
-            p = corners[k, c]
-            z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-            nearest = min(nearest, z)
-            if z < 0.05:
-                break
-            u = camera[0] * (T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]) / z + camera[2]
-            v = camera[1] * (T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]) / z + camera[3]
-            u_low, v_low, u_high, v_high = min(u_low, u), min(v_low, v), max(u_high, u), max(v_high, v)
-        if nearest < 0.05:
+        shown, u_low, v_low, u_high, v_high = bounding_rectangle(corners[k], poses[k], camera)
+        if not shown:
             continue
         u0, v0 = max(0.0, np.trunc(u_low) - margin), max(0.0, np.trunc(v_low) - margin)
         u1 = min(float(size[0]), np.trunc(u_high) + margin + 2)
@@ -149,15 +139,9 @@ def box_share_in_image(corners, pose, camera, size):
 
     `pose` (4, 4) T_camera_object, `size` (width, height). 0 where the box reaches behind the camera.
     """
-    u_low, v_low, u_high, v_high = np.inf, np.inf, -np.inf, -np.inf
-    for c in range(8):
-        p = corners[c]
-        z = pose[2, 0] * p[0] + pose[2, 1] * p[1] + pose[2, 2] * p[2] + pose[2, 3]
-        if z < 0.05:
-            return 0.0
-        u = camera[0] * (pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2] + pose[0, 3]) / z + camera[2]
-        v = camera[1] * (pose[1, 0] * p[0] + pose[1, 1] * p[1] + pose[1, 2] * p[2] + pose[1, 3]) / z + camera[3]
-        u_low, v_low, u_high, v_high = min(u_low, u), min(v_low, v), max(u_high, u), max(v_high, v)
+    shown, u_low, v_low, u_high, v_high = bounding_rectangle(corners, pose, camera)
+    if not shown:
+        return 0.0
     inside_u = max(0.0, min(u_high, size[0] - 0.5) - max(u_low, -0.5))
     inside_v = max(0.0, min(v_high, size[1] - 0.5) - max(v_low, -0.5))
     return inside_u * inside_v / max((u_high - u_low) * (v_high - v_low), 1e-9)
