@@ -12,6 +12,11 @@ from simtrack.training.networks import BoxNetwork
 from simtrack.training.scores import average_precision
 from simtrack.training.shards import LEAST_VISIBLE, Shards
 
+PASTED = 0.6
+"""Share of samples with objects of other images in them, ..."""
+MOST_PASTED = 3
+"""... at most so many."""
+
 
 class BoxTask:
     """Training of `BoxNetwork`; see `simtrack.training.loop.Task`."""
@@ -33,10 +38,14 @@ class BoxTask:
 
     def batch(self, rng: np.random.Generator) -> tuple[Tensor, ...]:
         """Random samples."""
-        picks = rng.integers(0, len(self._train), self.batch_size)
-        columns = zip(*(sample(self._train[int(i)], len(self.models), rng) for i in picks), strict=True)
+        columns = zip(*(self._sample(rng) for _ in range(self.batch_size)), strict=True)
         shown, *rest = [torch.from_numpy(np.stack(column)) for column in columns]
         return shown.contiguous(memory_format=torch.channels_last), *rest
+
+    def _sample(self, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+        further = int(rng.integers(1, MOST_PASTED + 1)) if rng.random() < PASTED else 0
+        record, *donors = (self._train[int(i)] for i in rng.integers(0, len(self._train), 1 + further))
+        return sample(record, donors, len(self.models), rng)
 
     def loss(self, network: BoxNetwork, batch: tuple[Tensor, ...]) -> Tensor:
         """Penalty-reduced focal loss of the heat, generalised IoU of the boxes."""
@@ -47,9 +56,10 @@ class BoxTask:
         positive = -peak * (1 - probability) ** 2 * torch.log(probability)
         negative = -(1 - peak) * (1 - heat) ** 4 * probability**2 * torch.log(1 - probability)
         focal = ((positive + negative) * learned[:, None]).sum() / peak.sum().clamp(min=1)
-        return focal + 2.0 * (
-            (1.0 - _generalised_overlap(torch.exp(distances), sides)) * weight
-        ).sum() / weight.sum().clamp(min=1)
+        told = weight > 0.0  # (N, C, h, w); their sides as (K, 4)
+        lengths = torch.exp(distances.unflatten(1, (-1, 4)).permute(0, 1, 3, 4, 2)[told])
+        missed = 1.0 - _generalised_overlap(lengths, sides.permute(0, 1, 3, 4, 2)[told])
+        return focal + 2.0 * (missed * weight[told]).sum() / weight.sum().clamp(min=1)
 
     def validate(self, network: BoxNetwork) -> dict[str, float]:
         """Average precision at an overlap of 0.5 of objects that are seen by more than half."""
@@ -68,7 +78,7 @@ class BoxTask:
 
 
 def _generalised_overlap(a: Tensor, b: Tensor) -> Tensor:
-    """(N, h, w), GIoU (Rezatofighi et al., CVPR 2019) of boxes given by the distances (N, 4, h, w) to their sides."""
+    """(K,), GIoU (Rezatofighi et al., CVPR 2019) of boxes given by the distances (K, 4) to their sides."""
     inner, outer = torch.minimum(a, b), torch.maximum(a, b)
     common = (inner[:, 0] + inner[:, 2]) * (inner[:, 1] + inner[:, 3])
     hull = (outer[:, 0] + outer[:, 2]) * (outer[:, 1] + outer[:, 3])

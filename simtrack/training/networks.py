@@ -72,32 +72,43 @@ def halved(channels_in: int, channels_out: int, blocks: int) -> nn.Sequential:
 
 
 class BoxNetwork(nn.Module):
-    """Heat maps of objects' centres and distances to the sides of their boxes, in cells of 8 pixels.
+    """Heat maps of objects' centres and distances to the sides of their boxes, in cells of 4 pixels.
 
-    CenterNet's heat maps (Zhou, Wang, Kraehenbuehl: Objects as Points, 2019) over one level of a feature pyramid.
+    CenterNet's heat maps (Zhou, Wang, Kraehenbuehl: Objects as Points, 2019) over a feature pyramid. Every class has
+    sides of its own: a thing in a box and the box may have their centres in one cell.
     """
 
     stride = STRIDE
 
     def __init__(self, classes: int) -> None:
         super().__init__()
-        self.stem = nn.Sequential(convolved(CHANNELS, 16, stride=2), halved(16, 32, 1))
+        self.stem, self.quarter = convolved(CHANNELS, 16, stride=2), halved(16, 32, 1)
         self.fine, self.middle, self.coarse = halved(32, 64, 2), halved(64, 128, 2), halved(128, 192, 1)
         self.from_coarse, self.from_middle = nn.Conv2d(192, 64, 1), nn.Conv2d(128, 64, 1)
-        self.joined = nn.Sequential(convolved(64, 64), Residual(64))
-        self.heat, self.sides = nn.Conv2d(64, classes, 1), nn.Conv2d(64, 4, 1)
+        self.joined, self.from_joined = nn.Sequential(convolved(64, 64), Residual(64)), nn.Conv2d(64, 32, 1)
+        self.last = nn.Sequential(convolved(32, 32), convolved(32, 32))
+        self.heat, self.sides = nn.Conv2d(32, classes, 1), nn.Conv2d(32, 4 * classes, 1)
         nn.init.constant_(self.heat.bias, -4.0)  # type: ignore[arg-type]
-        nn.init.constant_(self.sides.bias, 1.0)  # type: ignore[arg-type]
+        nn.init.constant_(self.sides.bias, 1.5)  # type: ignore[arg-type]
 
     @in_bfloat16
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 5, H, W) to logits (N, classes, H / 8, W / 8) and log distances (N, 4, H / 8, W / 8), in cells."""
-        fine = self.fine(self.stem(image))
+        """(N, 5, H, W) to logits (N, C, H / 4, W / 4) and log distances (N, 4 C, H / 4, W / 4), in cells.
+
+        Distances to the left, upper, right and lower side of class c are the channels from 4 c on.
+        """
+        quarter = self.quarter(self.stem(image))
+        fine = self.fine(quarter)
         middle = self.middle(fine)
         coarse = self.from_coarse(self.coarse(middle))
-        middle = self.from_middle(middle) + functional.interpolate(coarse, size=middle.shape[2:], mode="nearest")
-        joined = self.joined(fine + functional.interpolate(middle, size=fine.shape[2:], mode="nearest"))
-        return self.heat(joined), self.sides(joined).clamp(-4.0, 5.0)
+        middle = self.from_middle(middle) + _enlarged(coarse, middle)
+        joined = self.from_joined(self.joined(fine + _enlarged(middle, fine)))
+        last = self.last(quarter + _enlarged(joined, quarter))
+        return self.heat(last), self.sides(last).clamp(-4.0, 5.5)
+
+
+def _enlarged(features: Tensor, like: Tensor) -> Tensor:
+    return functional.interpolate(features, size=like.shape[2:], mode="nearest")
 
 
 class KeypointNetwork(nn.Module):

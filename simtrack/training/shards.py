@@ -13,8 +13,8 @@ from simtrack.perception.detection.boxes import overlap
 from simtrack.perception.detection.views import WINDOW, Pyramid, Window, reduced, warped, window_about
 from simtrack.training.source import Label, LabelledImage, Source, images
 
-IMAGE_WIDTH, IMAGE_HEIGHT = 320, 240
-"""Pixels, of what the box network is trained on."""
+IMAGE_WIDTH, IMAGE_HEIGHT = 480, 360
+"""Pixels, of the images that the box network looks at."""
 PATCH = 96
 """Pixels a side of the stored windows: larger than what is shown, so that it can be shifted, scaled and turned."""
 PATCH_WINDOW = 1.5 * WINDOW
@@ -34,12 +34,14 @@ IMAGES = np.dtype(
     [
         ("rgb", np.uint8, (IMAGE_HEIGHT, IMAGE_WIDTH, 3)),
         ("depth", np.float16, (IMAGE_HEIGHT, IMAGE_WIDTH)),
+        ("index", np.uint8, (IMAGE_HEIGHT, IMAGE_WIDTH)),
         ("boxes", np.float32, (MAX_OBJECTS, 4)),
         ("classes", np.int16, MAX_OBJECTS),
         ("visible", np.float32, MAX_OBJECTS),
     ]
 )
-"""Boxes in pixels of the small image, of whole silhouettes as far as they lie in the image; class -1 = no object."""
+"""Boxes in pixels of the small image, of whole silhouettes as far as they lie in the image; class -1 = no object. The
+index tells which object a pixel shows, from 1; 0 = none."""
 CROPS = np.dtype(
     [
         ("rgb", np.uint8, (PATCH, PATCH, 3)),
@@ -133,6 +135,7 @@ def _small(image: LabelledImage) -> np.ndarray:
         # Pixel centres lie at integer indices: the image begins half a pixel before the first one.
         record["boxes"][k] = (label.box + 0.5) * scale - 0.5
         record["classes"][k], record["visible"][k] = label.class_index, label.visible
+        record["index"][_small_mask(label)] = k + 1
     return record
 
 
@@ -171,6 +174,13 @@ def _free_boxes(camera: CameraIntrinsics, labels: Sequence[Label], rng: np.rando
         if all(overlap(box, label.box) < 0.1 for label in labels):
             found.append(box)
     return found
+
+
+def _small_mask(label: Label) -> np.ndarray:
+    import cv2
+
+    size = (IMAGE_WIDTH, IMAGE_HEIGHT)
+    return np.asarray(cv2.resize(_mask(label), size, interpolation=cv2.INTER_NEAREST)) > 0
 
 
 def _mask(label: Label) -> np.ndarray:

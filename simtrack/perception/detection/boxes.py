@@ -7,10 +7,10 @@ import numpy as np
 
 from simtrack.contracts import Float64
 
-STRIDE = 8
+STRIDE = 4
 """Pixels of the network's input in a cell of its answer."""
-SAME = 0.5
-"""Boxes of one class that overlap by more than this are one object's."""
+SAME = 0.65
+"""Boxes of one class that overlap by more than this are one object's: less, they may be those of two side by side."""
 MAX_BOXES = 40
 LEAST_SIDE = 8.0
 """Regions that are narrower or lower than this are no boxes, pixels of the image."""
@@ -31,26 +31,36 @@ def decoded_boxes(logits: np.ndarray, distances: np.ndarray, threshold: float) -
     """Boxes with a score above `threshold`, best first.
 
     Args:
-        logits: (classes, h, w), of objects' centres.
-        distances: (4, h, w), logarithms of the distances to the left, upper, right and lower side, in cells.
+        logits: (C, h, w), of objects' centres.
+        distances: (4 C, h, w), logarithms of the distances to the left, upper, right and lower side, in cells; those of
+            class c are the channels from 4 c on.
         threshold: 0 to 1.
     """
-    scores = 1.0 / (1.0 + np.exp(-logits.astype(float)))
-    padded = np.pad(scores, ((0, 0), (1, 1), (1, 1)))
-    h, w = scores.shape[1:]
-    around = np.max([padded[:, dv : dv + h, du : du + w] for dv in range(3) for du in range(3)], axis=0)
-    peaks = np.argwhere((scores >= around) & (scores > threshold))
+    scores = _probability(logits)
+    peaks = np.argwhere((scores >= _highest_around(scores)) & (scores > threshold))
     order = np.argsort([-scores[tuple(peak)] for peak in peaks], kind="stable") if len(peaks) else []
     found: list[Box] = []
     for k in order:
         c, v, u = (int(value) for value in peaks[k])
-        left, up, right, down = np.exp(distances[:, v, u].astype(float))
+        left, up, right, down = np.exp(distances[4 * c : 4 * c + 4, v, u].astype(float))
         corners = (np.array([u - left, v - up, u + right, v + down]) + 0.5) * STRIDE - 0.5
         if all(box.class_index != c or overlap(box.corners, corners) < SAME for box in found):
             found.append(Box(c, corners, float(scores[c, v, u])))
         if len(found) == MAX_BOXES:
             break
     return found
+
+
+def _probability(logits: np.ndarray) -> np.ndarray:
+    return 1.0 / (1.0 + np.exp(-logits.astype(float)))
+
+
+def _highest_around(scores: np.ndarray) -> np.ndarray:
+    """The highest of every cell and its eight neighbours."""
+    padded = np.pad(scores, ((0, 0), (1, 1), (1, 1)))
+    h, w = scores.shape[1:]
+    rows = np.maximum(np.maximum(padded[:, :h], padded[:, 1 : h + 1]), padded[:, 2:])
+    return np.maximum(np.maximum(rows[..., :w], rows[..., 1 : w + 1]), rows[..., 2:])
 
 
 def boxes_of_regions(logits: np.ndarray, regions: Sequence[Float64], scale: Float64, threshold: float) -> list[Box]:
@@ -64,7 +74,7 @@ def boxes_of_regions(logits: np.ndarray, regions: Sequence[Float64], scale: Floa
         scale: (2,), pixels of the image in one of the network's input.
         threshold: 0 to 1.
     """
-    scores = 1.0 / (1.0 + np.exp(-logits.astype(float)))
+    scores = _probability(logits)
     found: list[Box] = []
     for corners in regions:
         if min(corners[2] - corners[0], corners[3] - corners[1]) < LEAST_SIDE:

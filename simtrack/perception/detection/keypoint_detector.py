@@ -56,16 +56,17 @@ class KeypointDetectorConfig:
     """Boxes with a lower score are not looked at."""
     present: float = 0.98
     """Windows in which the object is with less probability than this are dropped."""
-    hint: float = 0.2
+    hint: float = 0.1
     """Boxes with at least this score are looked at, too, and regions that nothing explains with such a centre ..."""
     hints: int = 12
     """... at most so many, those with the highest scores, which are dropped ..."""
-    weak_present: float = 0.999
+    weak_present: float = 0.9995
     """... if the object is in the box with less probability than this ..."""
     region_present: float = 0.99
     """... or in the region with less than this."""
-    same: float = 0.25
-    """Objects of a class whose centres are nearer to each other than this are the same, in shares of a box's side."""
+    same: float = 0.15
+    """Detections of a class whose keypoints' centres are nearer to each other than this are of one object, in shares of
+    a box's side."""
     max_sigma: float = 0.3
     """Keypoints that are less certain than this, in shares of the window's side, are left out (NaN)."""
     runtime: Runtime = "onnxruntime"
@@ -141,19 +142,22 @@ class KeypointDetector:
         ]
         looked = clear + sorted(hints, key=lambda hint: -hint[0].score)[: config.hints]
         answers = self._closer([box for box, _ in looked], frame.rgb, frame.depth, frame.intrinsics.fx)
-        sure = [there >= least for (_, there), (_, least) in zip(answers, looked, strict=True)]
-        found = [answers[k][0] for k in range(len(clear)) if sure[k]]
-        further = [answers[k][0] for k in range(len(clear), len(looked)) if sure[k]]
-        return DetectionResult(frame.stamp, available, (*found, *self._unlike(further, found)))
+        found = [
+            (k >= len(clear), answer)
+            for k, ((answer, there), (_, least)) in enumerate(zip(answers, looked, strict=True))
+            if there >= least
+        ]
+        found.sort(key=lambda pair: (pair[0], -pair[1].score))
+        return DetectionResult(frame.stamp, available, tuple(self._unlike([detection for _, detection in found])))
 
-    def _unlike(self, further: Sequence[Detection], found: Sequence[Detection]) -> list[Detection]:
-        """Those of further detections that are not of the same object as one that was found, or as a better one."""
-        kept = list(found)
-        for detection in sorted(further, key=lambda d: -d.score):
-            side = self.config.same * float(np.max(detection.box[2:] - detection.box[:2]))
-            if all(d.class_name != detection.class_name or _apart(d, detection) > side for d in kept):
+    def _unlike(self, found: Sequence[Detection]) -> list[Detection]:
+        """Those of detections that are not of the same object as an earlier one."""
+        kept: list[Detection] = []
+        for detection in found:
+            reach = self.config.same * float(np.max(detection.box[2:] - detection.box[:2]))
+            if all(d.class_name != detection.class_name or _apart(d, detection) > reach for d in kept):
                 kept.append(detection)
-        return kept[len(found) :]
+        return kept
 
     def boxes(self, rgb: Uint8, depth: Float32, least_score: float | None = None) -> list[Box]:
         """Boxes of the wanted objects in an image, in its own pixels, best first; from the configured score on if None.
@@ -219,8 +223,9 @@ class KeypointDetector:
 
 
 def _apart(a: Detection, b: Detection) -> float:
-    """Pixels between the centres of two boxes."""
-    return 0.5 * float(np.linalg.norm(a.box[:2] + a.box[2:] - b.box[:2] - b.box[2:]))
+    """Pixels between the centres of two detections, as their keypoints tell them; else those of the boxes."""
+    centres = [d.keypoints[-1] if np.isfinite(d.keypoints[-1]).all() else 0.5 * (d.box[:2] + d.box[2:]) for d in (a, b)]
+    return float(np.linalg.norm(centres[0] - centres[1]))
 
 
 def known_classes(folder: Path) -> tuple[str, ...]:

@@ -88,14 +88,18 @@ def test_the_larger_of_two_modes_is_taken_and_both_make_it_uncertain() -> None:
 
 
 def test_boxes_of_one_object_become_one() -> None:
-    logits, sides = np.full((2, 6, 8), -9.0), np.zeros((4, 6, 8))
+    logits, sides = np.full((2, 6, 8), -9.0), np.zeros((8, 6, 8))
     logits[0, 2, 2], logits[0, 2, 4], logits[1, 2, 3] = 2.0, 1.0, 3.0
-    sides[:] = np.log(3.0)
+    sides[:] = np.log(5.0)
+    sides[4:] = np.log(2.0)  # of class 1
     found = decoded_boxes(logits, sides, threshold=0.5)
     assert [box.class_index for box in found] == [1, 0]  # best first; two near ones of one class are one
-    assert np.allclose(found[1].corners, (np.array([-1, -1, 5, 5]) + 0.5) * STRIDE - 0.5)
+    assert np.allclose(found[0].corners, (np.array([1, 0, 5, 4]) + 0.5) * STRIDE - 0.5)
+    assert np.allclose(found[1].corners, (np.array([-3, -3, 7, 7]) + 0.5) * STRIDE - 0.5)
     assert overlap(found[1].corners, found[1].corners) == 1.0
     assert decoded_boxes(logits, sides, threshold=0.99) == []
+    sides[:4] = np.log(3.0)  # side by side they may be two
+    assert [box.class_index for box in decoded_boxes(logits, sides, threshold=0.5)] == [1, 0, 0]
 
 
 def test_a_window_is_square_about_its_box() -> None:
@@ -109,7 +113,7 @@ def test_a_window_is_square_about_its_box() -> None:
 def test_regions_are_boxes_of_the_classes_that_have_a_centre_in_them() -> None:
     logits = np.full((3, 30, 40), -9.0, np.float32)
     logits[1, 10, 20], logits[2, 11, 20], logits[0, 2, 2] = 0.0, 2.0, 3.0
-    scale = np.array([2.0, 2.0])  # a cell is 16 pixels of the image
+    scale = np.array([4.0, 4.0])  # a cell is 16 pixels of the image
     around = np.array([310.0, 150.0, 350.0, 200.0])
     found = boxes_of_regions(logits, [around], scale, 0.1)
     assert [box.class_index for box in found] == [2, 1]
