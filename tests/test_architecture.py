@@ -120,6 +120,7 @@ def test_every_package_that_is_imported_is_a_declared_dependency() -> None:
     modules = {IMPORT_NAMES.get(name, name.replace("-", "_")) for name in declared} | {"simtrack"}
     modules |= {"llvmlite", "markupsafe", "pydantic_core", "pybullet_utils"}  # of numba, jinja2, pydantic, pybullet
     modules |= {"pytest"}  # whose plugin only pytest itself imports
+    modules |= {"ultralytics"}  # AGPL-3.0: installed by those who choose it, in no extra
     modules |= set(sys.stdlib_module_names)
     found = [(path, line, name.split(".")[0]) for path in MODULES for line, name in imported(path)]
     assert [f"{path}:{line}: {top}" for path, line, top in found if top not in modules] == []

@@ -47,7 +47,7 @@ def open_source(root: Path) -> Source:
     path = root / "dataset.json"
     if not path.is_file():
         raise DatasetError(root, "no dataset.json; expected a folder that `simtrack generate` made")
-    about = _json(path)
+    about = read_json(path)
     names = about.get("categories")
     if not isinstance(names, dict) or not names:
         raise FileFormatError(path, "categories", "missing; expected object ids with the names of their models")
@@ -113,8 +113,8 @@ def images(source: Source, scene: Path) -> Iterator[LabelledImage]:
     Raises:
         FileFormatError: a file is missing or damaged.
     """
-    cameras, poses = _json(scene / "scene_camera.json"), _json(scene / "scene_gt.json")
-    infos = _json(scene / "scene_gt_info.json")
+    cameras, poses = read_json(scene / "scene_camera.json"), read_json(scene / "scene_gt.json")
+    infos = read_json(scene / "scene_gt_info.json")
     for image in sorted(cameras, key=int):
         name = f"{int(image):06d}"
         files = [scene / "rgb" / f"{name}{suffix}" for suffix in (".jpg", ".png")]
@@ -152,7 +152,8 @@ def _labels(source: Source, scene: Path, image: str, poses: Any, infos: Any, sha
         yield Label(index, T, box, float(info["visib_fract"]), int(info["px_count_visib"]), mask)
 
 
-def _json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object; raises FileFormatError."""
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

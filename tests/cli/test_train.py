@@ -1,5 +1,6 @@
 """``simtrack train``, ``evaluate detector`` and ``run --detector`` as a user gives them."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,15 @@ def test_a_detector_is_trained_by_one_command(tmp_path: Path, monkeypatch: pytes
             ("train", "detector", "--data", "{tmp}", "--out", "{tmp}/out", "--minutes", "0"),
             "minutes = 0.0 is not valid",
         ),
+        (
+            ("train", "detector", "--data", "{tmp}", "--out", "{tmp}/out", "--arch", "yolov8-pose", "--part", "boxes"),
+            "--part = 'boxes' is not valid; allowed: both: yolov8-pose is one network",
+        ),
+        (("train", "segmenter", "--data", "{tmp}", "--out", "{tmp}/out", "--arch", "yolov8n-pose"), "--arch ="),
+        (
+            ("train", "detector", "--data", "{tmp}", "--out", "{tmp}/out", "--image-size", "320"),
+            "--image-size = 320 is not valid; allowed: none: it is for --arch yolov8-pose alone",
+        ),
         (("evaluate", "detector"), "--data is required"),
         (("train", "detector", "--out", "{tmp}/out"), "--data is required"),
         (("train", "agent", "--out", "{tmp}/out", "--minutes", "0"), "minutes = 0.0 is not valid"),
@@ -49,6 +59,20 @@ def test_what_cannot_be_used_is_told(tmp_path: Path, arguments: tuple[str, ...],
     done = simtrack_command(*(argument.format(tmp=tmp_path) for argument in arguments))
     assert done.returncode == 2
     assert told in " ".join(done.stderr.split())
+
+
+def test_the_licence_of_yolo_is_said_where_it_is_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import importlib.util
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())  # torch and onnx need not be there for it
+    monkeypatch.setitem(sys.modules, "ultralytics", None)
+    for name in ("YOLO_OFFLINE", "YOLO_AUTOINSTALL", "YOLO_CONFIG_DIR"):
+        monkeypatch.setenv(name, "")
+    done = simtrack_command("train", "detector", "--arch", "yolov8-pose", "--data", tmp_path, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert "yolov8s-pose" in done.stdout and "AGPL-3.0" in done.stdout
+    assert "ultralytics is not installed" in done.stderr and "AGPL-3.0" in done.stderr
+    assert "AGPL-3.0" in simtrack_command("train", "--help").stdout
 
 
 def test_without_torch_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
