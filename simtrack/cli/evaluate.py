@@ -48,7 +48,8 @@ def evaluate(
         work: Folder where rooms are kept as they are done; runs/evaluate-WHAT if not given.
         workers: Processes of a reconstruction; one a core if not given. Maps are made one after the other.
         data: Detector: folder of a generated data set with the format bop that it was not trained on.
-        detector: keypoints (the networks that come along), or a folder that `simtrack train detector` wrote.
+        detector: keypoints (the networks that come along), a folder that `simtrack train detector` wrote, or a
+            YOLOv8-pose .onnx file.
         count: Detector: images at most.
     """
     from simtrack.errors import InvalidValueError
@@ -69,8 +70,7 @@ def _detector(data: Path | None, detector: str, count: int | None, out: Path) ->
     from simtrack.cli import console
     from simtrack.errors import InvalidValueError, MissingValueError
     from simtrack.evaluation.detector import evaluate_detector, write_scores
-    from simtrack.perception.detection.keypoint_detector import KeypointDetector
-    from simtrack.perception.detection.loading import KEYPOINTS
+    from simtrack.perception.detection.loading import make_image_detector
     from simtrack.training.source import open_source
 
     if data is None:
@@ -79,7 +79,7 @@ def _detector(data: Path | None, detector: str, count: int | None, out: Path) ->
         raise InvalidValueError("count", count, "1 or more")
     source = open_source(data)
     models = {model.name: model for model in source.models}
-    opened = KeypointDetector(models, None if detector == KEYPOINTS else Path(detector))
+    opened = make_image_detector(detector, models)
     with console.ProgressLine("evaluate detector", "compiling") as line:
         scores = evaluate_detector(source, opened, count, lambda done, of: line.show(f"{done}/{of} images", done / of))
     metrics = scores.metrics()

@@ -4,16 +4,16 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import process_time
+from typing import Protocol
 
 import numpy as np
 
-from simtrack.contracts import CameraIntrinsics, Detection, Float64, RgbdFrame
+from simtrack.contracts import CameraIntrinsics, Detection, DetectionResult, Float32, Float64, RgbdFrame, Uint8
 from simtrack.evaluation.bop_recall import BopRecall
 from simtrack.evaluation.metrics import Metric, Metrics, measured, quantile, ratio
 from simtrack.evaluation.pose_errors import PoseScorer
 from simtrack.objects import ObjectModel
 from simtrack.perception.detection.boxes import Box, overlap
-from simtrack.perception.detection.keypoint_detector import KeypointDetector
 from simtrack.perception.detection.pnp import project_points, solve_pose
 from simtrack.perception.detection.pose_search import PoseSearch
 from simtrack.perception.tracking.birth import FitConfig, Prober
@@ -33,6 +33,23 @@ STEPS = {"pnp": (0.02, 15.0), "depth": (0.02, 15.0), "registered": (0.005, 3.0)}
 OUTCOMES = ("undetected", "no_pose", "misplaced", "misturned", "not_believed", "wrong", "good")
 """What becomes of an object: no box of it; no pose agrees with it; the search's best one is not good, in position or,
 being good, in orientation, and none is believed; a good one is not believed; a believed one is not good; one is."""
+
+
+class BoxDetector(Protocol):
+    """A detector that also tells its boxes with low scores; simtrack's own image detectors do."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """That it knows, in the order of their indices."""
+        ...
+
+    def boxes(self, rgb: Uint8, depth: Float32, least_score: float) -> list[Box]:
+        """In the image's pixels."""
+        ...
+
+    def detect(self, frame: RgbdFrame) -> DetectionResult:
+        """As `simtrack.contracts.Detector`."""
+        ...
 
 
 @dataclass(slots=True)
@@ -95,7 +112,7 @@ class DetectorScores:
 
 def evaluate_detector(
     source: Source,
-    detector: KeypointDetector,
+    detector: BoxDetector,
     count: int | None = None,
     told: Callable[[int, int], None] | None = None,
 ) -> DetectorScores:
@@ -132,12 +149,16 @@ def _some(source: Source, count: int | None) -> Iterator[tuple[int, int, Labelle
             yield number, total, image
 
 
-def _score(scores: DetectorScores, steps: "_PoseSteps", detector: KeypointDetector, image: LabelledImage) -> None:
+def _score(scores: DetectorScores, steps: "_PoseSteps", detector: BoxDetector, image: LabelledImage) -> None:
     frame = RgbdFrame(0, image.depth, image.rgb, image.intrinsics, np.eye(4))
     began = process_time()
     detections = detector.detect(frame).detections
     scores.seconds.append(process_time() - began)
-    scores.found.append(detector.boxes(image.rgb, image.depth, LEAST_SCORE))
+    index_of = {model.name: index for index, model in enumerate(scores.models)}
+    named = [
+        (detector.class_names[box.class_index], box) for box in detector.boxes(image.rgb, image.depth, LEAST_SCORE)
+    ]
+    scores.found.append([Box(index_of[name], box.corners, box.score) for name, box in named if name in index_of])
     labels = image.labels
     scores.there.append(
         (

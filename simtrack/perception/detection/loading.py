@@ -2,10 +2,14 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from simtrack.contracts import Detector
 from simtrack.errors import FileFormatError
 from simtrack.objects import ObjectModel
+
+if TYPE_CHECKING:
+    from simtrack.perception.detection.keypoint_detector import KeypointDetector
+    from simtrack.perception.detection.yolo_pose import YoloPoseDetector
 
 KEYPOINTS = "keypoints"
 """The networks that come along."""
@@ -25,9 +29,8 @@ def check_image_detector(given: str) -> None:
     wanted = [folder] if given.endswith(".onnx") else [folder / own.BOXES, folder / own.KEYPOINTS]
     for path in wanted:
         if not path.is_file():
-            raise FileFormatError(
-                path, "", "no such file; `simtrack train detector` makes boxes.onnx and keypoints.onnx"
-            )
+            made = "with --arch yolov8-pose makes one" if path == Path(given) else "makes boxes.onnx and keypoints.onnx"
+            raise FileFormatError(path, "", f"no such file; `simtrack train detector` {made}")
 
 
 def known_classes(given: str) -> tuple[str, ...]:
@@ -41,7 +44,7 @@ def known_classes(given: str) -> tuple[str, ...]:
     return own.known_classes(own.SHIPPED if given == KEYPOINTS else Path(given))
 
 
-def make_image_detector(given: str, models: Mapping[str, ObjectModel]) -> Detector:
+def make_image_detector(given: str, models: Mapping[str, ObjectModel]) -> "KeypointDetector | YoloPoseDetector":
     """Open a detector.
 
     Args:

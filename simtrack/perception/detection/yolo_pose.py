@@ -11,16 +11,28 @@ from pathlib import Path
 
 import numpy as np
 
-from simtrack.contracts import NANOSECONDS, Detection, DetectionResult, Float64, RegionOfInterest, RgbdFrame, Status
+from simtrack.contracts import (
+    NANOSECONDS,
+    Detection,
+    DetectionResult,
+    Float32,
+    Float64,
+    RegionOfInterest,
+    RgbdFrame,
+    Status,
+    Uint8,
+)
 from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.objects import ObjectModel
-from simtrack.perception.detection.boxes import overlap
+from simtrack.perception.detection.boxes import Box, overlap
 from simtrack.perception.detection.onnx_network import OnnxNetwork, Runtime, open_network
 
 KEYPOINTS, VALUES = 9, 3
 """The corners of the object's box and its centre, each with u, v, visibility."""
 GREY = 114
 """What ultralytics fills an image up with."""
+MOST = 1000
+"""Answers that are looked at, those with the highest scores."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +87,28 @@ class YoloPoseDetector:
         available = frame.stamp + int(self.config.latency * NANOSECONDS)
         if frame.rgb is None:
             return DetectionResult(frame.stamp, available, (), Status.NO_DATA)
-        image, scale, shift = letterboxed(frame.rgb, *self._size)
-        rows = self._rows(self._network.run({self._input: image})[0])
+        return DetectionResult(frame.stamp, available, tuple(self._found(frame.rgb, self.config.score)))
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """That the network knows, in the order of its answers."""
+        return tuple(self._names.values())
+
+    def boxes(self, rgb: Uint8, depth: Float32, least_score: float | None = None) -> list[Box]:
+        """Boxes of the wanted objects in an image, in its own pixels, best first; from the configured score on if None.
+
+        Args:
+            rgb: (H, W, 3).
+            depth: not looked at.
+            least_score: 0 to 1.
+        """
+        found = self._found(rgb, self.config.score if least_score is None else least_score)
+        return [Box(self.class_names.index(d.class_name), d.box, d.score) for d in found]
+
+    def _found(self, rgb: Uint8, least_score: float) -> list[Detection]:
+        """The best of those that overlap, best first."""
+        image, scale, shift = letterboxed(rgb, *self._size)
+        rows = self._rows(self._network.run({self._input: image})[0], least_score)
         found: list[Detection] = []
         for row in rows:
             index = int(np.argmax(row[4 : 4 + len(self._names)]))
@@ -85,9 +117,9 @@ class YoloPoseDetector:
                 o.class_name != detection.class_name or overlap(o.box, detection.box) < self.config.same for o in found
             ):
                 found.append(detection)
-        return DetectionResult(frame.stamp, available, tuple(found))
+        return found
 
-    def _rows(self, answer: np.ndarray) -> Float64:
+    def _rows(self, answer: np.ndarray, least_score: float) -> Float64:
         """(K, 4 + classes + 27) of the wanted objects, best first."""
         columns = 4 + len(self._names) + KEYPOINTS * VALUES
         if answer.ndim != 3 or answer.shape[:2] != (1, columns):
@@ -98,9 +130,9 @@ class YoloPoseDetector:
         rows = answer[0].T.astype(float)
         scores = rows[:, 4 : 4 + len(self._names)]
         best = scores.max(axis=1)
-        kept = (best >= self.config.score) & np.isin(scores.argmax(axis=1), list(self._wanted))
+        kept = (best >= least_score) & np.isin(scores.argmax(axis=1), list(self._wanted))
         order = np.argsort(-best[kept], kind="stable")
-        return rows[kept][order]
+        return rows[kept][order][:MOST]
 
     def _detection(self, row: Float64, index: int, scale: float, shift: Float64) -> Detection:
         centre, size = row[:2], row[2:4]

@@ -64,6 +64,19 @@ def test_its_answers_in_our_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     assert made.detect(RgbdFrame(5, frame.depth, None, CAMERA, np.eye(4))).status is Status.NO_DATA
 
 
+def test_its_boxes_down_to_any_score(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = detector(monkeypatch)
+    rgb, depth = np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), np.float32)
+    boxes = made.boxes(rgb, depth, 0.1)
+    assert [(made.class_names[box.class_index], round(box.score, 3)) for box in boxes] == [
+        ("tile", 0.9),
+        ("brick", 0.7),
+        ("brick", 0.2),
+    ]
+    found = made.detect(RgbdFrame(5, depth, rgb, CAMERA, np.eye(4))).detections
+    assert [box.corners.tolist() for box in made.boxes(rgb, depth)] == [d.box.tolist() for d in found]
+
+
 def test_an_image_is_fitted_as_it_was_trained() -> None:
     rgb = np.full((480, 640, 3), 255, np.uint8)
     image, scale, shift = letterboxed(rgb, SIZE, SIZE)
