@@ -1,7 +1,8 @@
 """What ultralytics' YOLOv8 learns from: the YOLO part of a generated data set, laid out for one training.
 
 Images stay where they are, behind links. Labels are written anew: ultralytics keeps a cache beside them, which is not
-to be left in the data set, and objects that look alike in several poses get the keypoints of one pose a view (see
+to be left in the data set. Where there is a BOP part, too, boxes become those of whole objects, hidden parts included,
+as the search for poses expects them, and objects that look alike in several poses get the keypoints of one of them (see
 `canonical_view`), since a network that is taught all of them answers with their mean.
 """
 
@@ -60,13 +61,13 @@ def prepare_yolo(root: Path, folder: Path) -> YoloData:
     about = _about(root, part / "data.yaml")
     classes = tuple(about["names"].values())
     scenes = _scenes(root, part, about)
-    alike = _Alike.of(root, classes)
+    poses = _Poses.of(root, classes)
     shutil.rmtree(folder, ignore_errors=True)
     seen: set[int] = set()
     counts: dict[str, int] = dict.fromkeys(SPLITS, 0)
     for split in SPLITS:
         for images in scenes[split]:
-            shown = _lay_out(part, images, folder, split, len(classes), alike)
+            shown = _lay_out(part, images, folder, split, len(classes), poses)
             counts[split] += len(shown)
             seen |= set().union(*shown) if split == "train" else set()
     missing = [name for index, name in enumerate(classes) if index not in seen]
@@ -120,21 +121,21 @@ def _scenes(root: Path, part: Path, about: Mapping[str, Any]) -> dict[str, list[
 
 
 def _lay_out(
-    part: Path, images: Path, folder: Path, split: str, classes: int, alike: "_Alike | None"
+    part: Path, images: Path, folder: Path, split: str, classes: int, poses: "_Poses | None"
 ) -> list[set[int]]:
     """Link the images of a scene and write its labels; returns the classes that each of its images shows."""
     link, labels = (folder / kind / split / images.name for kind in ("images", "labels"))
     link.parent.mkdir(parents=True, exist_ok=True)
     link.symlink_to(images.resolve(), target_is_directory=True)
     labels.mkdir(parents=True)
-    poses = alike.scene(images.name) if alike else {}
+    placed = poses.scene(images.name) if poses else {}
     source = part / "labels" / images.relative_to(part / "images")
     shown = []
     for image in sorted(images.glob("*.[jp][pn]g")):
         path = source / f"{image.stem}.txt"
         rows = _rows(path, classes)
-        if alike:
-            rows = [alike.row(path, row, poses.get(int(image.stem), [])) for row in rows]
+        if poses:
+            rows = [poses.row(path, row, placed.get(int(image.stem), [])) for row in rows]
         text = "".join(f"{int(row[0])} " + " ".join(f"{value:.6g}" for value in row[1:]) + "\n" for row in rows)
         (labels / path.name).write_text(text, encoding="ascii")
         shown.append({int(row[0]) for row in rows})
@@ -159,86 +160,95 @@ def _rows(path: Path, classes: int) -> list[Float64]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Pose:
+class _Placed:
     """An object in an image, as the BOP part has it."""
 
     index: int
     """Of its class."""
-    box: Float64
-    """(4,), of what is seen: left, top, width, height, pixels."""
+    visible: Float64
+    """(4,), box of what is seen: left, top, right, bottom edge, pixels."""
+    whole: Float64
+    """(4,), of the silhouette as far as it lies in the image, likewise."""
     T_camera_object: Float64
     K: CameraIntrinsics
 
 
 @dataclass(frozen=True, slots=True)
-class _Alike:
-    """Objects that look alike in several poses."""
+class _Poses:
+    """What the BOP part tells beyond the YOLO part."""
 
     source: Source
     size: Float64
     """(2,), width and height of images, pixels."""
 
     @classmethod
-    def of(cls, root: Path, classes: tuple[str, ...]) -> "_Alike | None":
-        """None if there are none."""
+    def of(cls, root: Path, classes: tuple[str, ...]) -> "_Poses | None":
+        """None where there is no BOP part, and none is needed."""
         try:
-            if all(load_object(name).symmetries.trivial for name in classes):
-                return None
+            trivial = all(load_object(name).symmetries.trivial for name in classes)
         except UnknownNameError as error:
             reason = f"no model of one of its objects; name their folder in $SIMTRACK_OBJECTS. {error}"
             raise DatasetError(root, reason) from error
-        path = root / "bop" / "camera.json"
+        if trivial and not (root / "bop").is_dir():
+            return None
         source = open_source(root)
         if source.class_names != classes:
             raise DatasetError(root, f"its BOP part has the classes {source.class_names}, its YOLO part {classes}")
+        path = root / "bop" / "camera.json"
         camera = read_json(path)
         try:
             return cls(source, np.array([float(camera["width"]), float(camera["height"])]))
         except (KeyError, TypeError, ValueError) as error:
             raise FileFormatError(path, "width, height", "expected the images' size in pixels") from error
 
-    def scene(self, name: str) -> dict[int, list[_Pose]]:
-        """Such objects by image."""
+    def scene(self, name: str) -> dict[int, list[_Placed]]:
+        """The objects of each image."""
         folder = next((path for path in self.source.scenes if path.name == name), None)
         if folder is None:
             raise DatasetError(self.source.root, f"its BOP part lacks scene {name}, which its YOLO part has")
         cameras, poses, infos = (read_json(folder / f"scene_{kind}.json") for kind in ("camera", "gt", "gt_info"))
-        width, height = (int(value) for value in self.size)
-        found: dict[int, list[_Pose]] = {}
         try:
-            for image, camera in cameras.items():
-                fx, _, cx, _, fy, cy, *_ = (float(value) for value in camera["cam_K"])
-                K = CameraIntrinsics(width, height, fx, fy, cx, cy)
-                for pose, info in zip(poses[image], infos[image], strict=True):
-                    index = self.source.class_of[pose["obj_id"]]
-                    if not self.source.models[index].symmetries.trivial and info["px_count_visib"] > 0:
-                        T = np.eye(4)
-                        T[:3, :3] = np.reshape(pose["cam_R_m2c"], (3, 3))
-                        T[:3, 3] = np.asarray(pose["cam_t_m2c"]) / MILLIMETRES
-                        # BOP's width and height are differences of the first and last pixel.
-                        box = np.array(info["bbox_visib"], float) + [0, 0, 1, 1]
-                        found.setdefault(int(image), []).append(_Pose(index, box, T, K))
+            return {int(image): self._placed(camera, poses[image], infos[image]) for image, camera in cameras.items()}
         except (KeyError, TypeError, ValueError) as error:
             reason = f"no complete entry: {type(error).__name__} {error}"
             raise FileFormatError(folder, "scene_camera.json, scene_gt.json, scene_gt_info.json", reason) from error
-        return found
 
-    def row(self, path: Path, row: Float64, poses: list[_Pose]) -> Float64:
-        """A label with the keypoints of the pose that is to be learned."""
+    def _placed(self, camera: Any, poses: Any, infos: Any) -> list[_Placed]:
+        width, height = (int(value) for value in self.size)
+        fx, _, cx, _, fy, cy, *_ = (float(value) for value in camera["cam_K"])
+        K, limit = CameraIntrinsics(width, height, fx, fy, cx, cy), np.tile(self.size, 2)
+        placed = []
+        for pose, info in zip(poses, infos, strict=True):
+            if info["px_count_visib"] <= 0:
+                continue
+            T = np.eye(4)
+            T[:3, :3] = np.reshape(pose["cam_R_m2c"], (3, 3))
+            T[:3, 3] = np.asarray(pose["cam_t_m2c"]) / MILLIMETRES
+            # BOP's widths and heights are differences between the first pixel and the last.
+            visible, whole = (
+                np.array([x, y, x + w + 1, y + h + 1], float) for x, y, w, h in (info["bbox_visib"], info["bbox_obj"])
+            )
+            index = self.source.class_of[pose["obj_id"]]
+            placed.append(_Placed(index, visible, np.clip(whole, 0.0, limit), T, K))
+        return placed
+
+    def row(self, path: Path, row: Float64, placed: list[_Placed]) -> Float64:
+        """A label with the box of the whole object and, where it looks alike in others, keypoints of one pose."""
         model = self.source.models[int(row[0])]
-        if model.symmetries.trivial:
-            return row
-        box = np.concatenate([row[1:3] - row[3:5] / 2, row[3:5]]) * np.tile(self.size, 2)
-        same = [pose for pose in poses if pose.index == row[0] and np.allclose(pose.box, box, atol=0.1)]
+        box = np.concatenate([row[1:3] - row[3:5] / 2, row[1:3] + row[3:5] / 2]) * np.tile(self.size, 2)
+        same = [p for p in placed if p.index == row[0] and np.allclose(p.visible, box, atol=0.1)]
         if not same:
             reason = f"{model.name} with the box {box.round().astype(int).tolist()} is not in the BOP part"
             raise FileFormatError(path, "", reason)
-        T = canonical_view(same[0].T_camera_object, model)
-        shares = (project(apply(T, model.keypoints), same[0].K) + 0.5) / self.size
-        inside = np.all((shares >= 0.0) & (shares <= 1.0), axis=1)
-        # Whether a keypoint is seen or hidden makes no difference to ultralytics, only whether it is labelled.
-        labels = np.where(inside[:, None], np.column_stack([shares, np.full(len(shares), 2.0)]), 0.0)
-        return np.concatenate([row[:5], labels.ravel()])
+        low, high = same[0].whole[:2] / self.size, same[0].whole[2:] / self.size
+        points = row[5:]
+        if not model.symmetries.trivial:
+            T = canonical_view(same[0].T_camera_object, model)
+            shares = (project(apply(T, model.keypoints), same[0].K) + 0.5) / self.size
+            inside = np.all((shares >= 0.0) & (shares <= 1.0), axis=1)
+            # Whether a keypoint is seen or hidden makes no difference to ultralytics, only whether it is labelled.
+            points = np.where(inside[:, None], np.column_stack([shares, np.full(len(shares), 2.0)]), 0.0).ravel()
+        return np.concatenate([row[:1], (low + high) / 2, high - low, points])
 
 
 def _written(folder: Path, about: Mapping[str, Any]) -> Path:

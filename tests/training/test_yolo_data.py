@@ -48,17 +48,38 @@ def test_the_data_set_stays_as_it_is_and_nothing_old_stays_in_the_folder(tmp_pat
 def test_a_view_of_what_looks_alike_has_one_set_of_keypoints(tmp_path: Path) -> None:
     root = write_yolo_dataset(tmp_path / "data")
     found = labels(prepare_yolo(root, tmp_path / "out"))
-    for name, ((index, *numbers),) in found.items():
+    for name, (row,) in found.items():
         (raw,) = np.loadtxt(root / "yolo" / "pose" / "labels" / name, ndmin=2)
-        points, given = (np.reshape(row, (9, 3)) for row in (numbers[4:], raw[5:]))
-        np.testing.assert_allclose([index, *numbers[:4]], raw[:5], atol=1e-6)
+        points, given = (np.reshape(numbers[5:], (9, 3)) for numbers in (row, raw))
         # The x axis points to the right, as it does in even images; half a turn swaps corners across the middle.
-        assert (points[1:8:2, 0] > points[0:8:2, 0]).all()
         turned = [3, 2, 1, 0, 7, 6, 5, 4, 8] if name.endswith("1.txt") else list(range(9))
-        np.testing.assert_allclose(points[:, :2], given[turned][:, :2], atol=1e-5)
+        np.testing.assert_allclose(points, given[turned], atol=1e-5)
+        pairs = [(a, a + 1) for a in range(0, 8, 2) if points[a, 2] and points[a + 1, 2]]
+        assert all(points[b, 0] > points[a, 0] for a, b in pairs)
+        assert len(pairs) == 4 or name.endswith("1.txt")
 
 
-def test_labels_of_others_are_kept_without_poses(tmp_path: Path) -> None:
+def test_boxes_are_of_whole_objects_as_far_as_they_are_in_the_image(tmp_path: Path) -> None:
+    root = write_yolo_dataset(tmp_path / "data", name="relay")
+    cut = 0
+    for name, (row,) in labels(prepare_yolo(root, tmp_path / "out")).items():
+        (raw,) = np.loadtxt(root / "yolo" / "pose" / "labels" / name, ndmin=2)
+        np.testing.assert_allclose(row[5:], raw[5:], atol=1e-6)
+        (left, top), (right, bottom) = row[1:3] - row[3:5] / 2, row[1:3] + row[3:5] / 2
+        u, v, known = np.reshape(row[5:], (9, 3)).T
+        # Corners are labelled half a pixel from the edges of their pixels, rounded to the nearest one.
+        tolerance = 1.01 / np.array([160, 120])
+        if known.all():
+            np.testing.assert_allclose([left, right], [u.min(), u.max()], atol=tolerance[0])
+        else:
+            cut += 1
+            assert left == pytest.approx(0.0, abs=1e-6)
+        np.testing.assert_array_less(np.abs([right - u[known > 0].max(), bottom - v[known > 0].max()]), tolerance)
+        assert row[3] > raw[3] and top <= v[known > 0].min() + tolerance[1]
+    assert cut
+
+
+def test_labels_are_kept_where_there_are_no_poses(tmp_path: Path) -> None:
     root = write_yolo_dataset(tmp_path / "data", name="relay", bop=False)
     for name, rows in labels(prepare_yolo(root, tmp_path / "out")).items():
         np.testing.assert_allclose(rows, np.loadtxt(root / "yolo" / "pose" / "labels" / name, ndmin=2), atol=1e-6)

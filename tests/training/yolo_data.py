@@ -22,7 +22,8 @@ ABOUT = "pose/data.yaml"
 def write_yolo_dataset(
     root: Path, *, name: str = "klt3147", train: int = 2, val: int = 1, images: int = 2, bop: bool = True
 ) -> Path:
-    """One object before a wall: upright in even images, turned by 180 degrees about z in odd ones, seen from above."""
+    """One object before a wall, whose right half is seen: unturned in even images, turned by 180 degrees about z in odd
+    ones, in which the image's left edge cuts it."""
     import cv2
     import yaml
 
@@ -38,21 +39,26 @@ def write_yolo_dataset(
             folder.mkdir(parents=True)
         content: dict[str, dict[str, Any]] = {"camera": {}, "gt": {}, "gt_info": {}}
         for image in range(images):
-            T = transform(HALF_TURN if image % 2 else None, (*rng.uniform(-0.1, 0.1, 2), 1.2))
+            x, y = rng.uniform(-0.1, 0.1, 2) - [0.6 * (image % 2), 0]
+            T = transform(HALF_TURN if image % 2 else None, (x, y, 1.2))
             pixels = project(apply(T, model.keypoints), CAMERA)
-            first, last = pixels.min(axis=0).round().astype(int), pixels.max(axis=0).round().astype(int)
+            whole, last = pixels.min(axis=0).round().astype(int), pixels.max(axis=0).round().astype(int)
+            first = np.array([max(0, (whole[0] + last[0]) // 2), whole[1]])
             rgb = rng.integers(0, 60, (HEIGHT, WIDTH, 3)).astype(np.uint8)
             rgb[first[1] : last[1] + 1, first[0] : last[0] + 1] = (40, 160, 220)
             cv2.imwrite(str(folders["images"] / f"{image:06d}.jpg"), rgb)
             size = np.array([WIDTH, HEIGHT])
             words = [0, *((first + last + 1) / 2 / size), *((last + 1 - first) / size)]
-            words += np.column_stack([(pixels + 0.5) / size, np.full(len(pixels), 2)]).ravel().tolist()
+            points = np.column_stack([(pixels + 0.5) / size, np.full(len(pixels), 2)])
+            points[(pixels < -0.5).any(axis=1)] = 0.0
+            words += points.ravel().tolist()
             (folders["labels"] / f"{image:06d}.txt").write_text(" ".join(f"{word:.6f}" for word in words) + "\n")
             content["camera"][str(image)] = {"cam_K": [150.0, 0, 79.5, 0, 150.0, 59.5, 0, 0, 1], "depth_scale": 0.1}
             pose = {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (1000 * T[:3, 3]).tolist(), "obj_id": 1}
             content["gt"][str(image)] = [pose]
-            box = [*first.tolist(), *(last - first).tolist()]
-            content["gt_info"][str(image)] = [{"bbox_visib": box, "px_count_visib": 1200}]
+            boxes = {"bbox_visib": first, "bbox_obj": whole}
+            info = {key: [*low.tolist(), *(last - low).tolist()] for key, low in boxes.items()}
+            content["gt_info"][str(image)] = [{**info, "px_count_visib": 1200}]
         for kind, entries in content.items():
             (root / "bop" / "train_pbr" / number / f"scene_{kind}.json").write_text(json.dumps(entries))
         (root / "scenes" / f"{number}.json").write_text("{}")
