@@ -39,8 +39,8 @@ def write_yolo_dataset(
             folder.mkdir(parents=True)
         content: dict[str, dict[str, Any]] = {"camera": {}, "gt": {}, "gt_info": {}}
         for image in range(images):
-            x, y = rng.uniform(-0.1, 0.1, 2) - [0.6 * (image % 2), 0]
-            T = transform(HALF_TURN if image % 2 else None, (x, y, 1.2))
+            x, y = rng.uniform(-0.1, 0.1, 2)
+            T = transform(HALF_TURN, (-0.62, y, 1.2)) if image % 2 else transform(None, (x, y, 1.2))
             pixels = project(apply(T, model.keypoints), CAMERA)
             whole, last = pixels.min(axis=0).round().astype(int), pixels.max(axis=0).round().astype(int)
             first = np.array([max(0, (whole[0] + last[0]) // 2), whole[1]])
