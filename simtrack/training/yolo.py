@@ -7,6 +7,7 @@ training's folder alone.
 
 import importlib
 import json
+import logging
 import os
 import shutil
 import time
@@ -35,6 +36,8 @@ STRIDE = 32
 """The image size is a multiple of this."""
 WARM_IMAGES = 16_000
 """In which the learning rate rises, at most; ultralytics' own limit is three epochs."""
+PLAIN = 10
+"""One in so many epochs, the last ones, shows images as they are, not four in one: ultralytics' own share."""
 KEPT, PROGRESS = "kept", "progress.json"
 UPLOADS = ("sync", "hub", "clearml", "comet", "dvc", "mlflow", "neptune", "raytune", "tensorboard", "wandb")
 """Settings of ultralytics that report to others or load their packages."""
@@ -87,6 +90,7 @@ def train_yolo(arch: YoloArch, config: TrainingConfig, image_size: int = 640) ->
     if progress.epochs < planned_epochs(progress, config.minutes):
         _learn(ultralytics, arch, config, image_size, data, folder, progress)
     best = ultralytics.YOLO(str(folder / KEPT / "best.pt"))
+    logging.getLogger("ultralytics").setLevel(logging.WARNING)  # it would name a file that is moved
     exported = Path(best.export(format="onnx", imgsz=image_size, simplify=False, device="cpu"))
     path = config.out / f"{arch}.onnx"
     exported.replace(path)
@@ -172,6 +176,7 @@ class _Schedule:
         epoch = getattr(trainer, "epoch", None)
         now = self._before if epoch is None else YoloProgress(epoch + 1, self._seconds())
         trainer.epochs = trainer.args.epochs = max(planned_epochs(now, self._minutes), now.epochs)
+        trainer.args.close_mosaic = max(1, trainer.epochs // PLAIN)
 
     def _watch(self, trainer: Any) -> None:
         if self._minutes is not None and self._seconds() > 60.0 * self._minutes:

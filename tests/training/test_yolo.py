@@ -37,6 +37,8 @@ class StandIn(ModuleType):
         self.calls: list[tuple[str, dict[str, Any]]] = []
         self.rates: list[list[float]] = []
         """Learning rate of each epoch by its linear schedule, one list a call."""
+        self.mosaics: list[bool] = []
+        """Whether an epoch showed four images in one."""
         self.epochs_ever = 0
         self.interrupted_at: tuple[int, int] | None = None
         """Epoch and batch."""
@@ -62,14 +64,15 @@ class Network:
         weights = Path(arguments["save_dir"]) / "weights"
         weights.mkdir(exist_ok=True)
         trainer = SimpleNamespace(
-            args=SimpleNamespace(epochs=arguments.get("epochs", 1)), epochs=arguments.get("epochs", 1), stop=False,
-            best=weights / "best.pt", last=weights / "last.pt", best_fitness=None, fitness=None,
+            args=SimpleNamespace(epochs=arguments.get("epochs", 1), close_mosaic=10),
+            epochs=arguments.get("epochs", 1), stop=False, best=weights / "best.pt", last=weights / "last.pt", best_fitness=None, fitness=None,
         )  # fmt: skip
         self._tell("on_pretrain_routine_start", trainer)
         assert first < trainer.epochs == trainer.args.epochs, "nothing to resume"
         for epoch in range(first, 10_000):
             trainer.epoch = epoch
             package.rates[-1].append(1 - epoch / trainer.epochs)
+            package.mosaics.append(epoch < trainer.epochs - trainer.args.close_mosaic)
             for batch in range(BATCHES):
                 if package.interrupted_at == (epoch, batch):
                     trainer.last.write_text("cut sh")
@@ -141,6 +144,7 @@ def test_it_ends_by_the_clock_with_a_falling_rate(tmp_path: Path, data: Path, ul
     assert 60.0 - 0.5 * BATCHES * SECONDS <= ultralytics.now <= 60.0 + SECONDS
     (rates,) = ultralytics.rates
     assert rates == sorted(rates, reverse=True) and rates[-1] == pytest.approx(1 / len(rates))
+    assert ultralytics.mosaics == [True] * (len(rates) - 1) + [False]
 
 
 def test_less_time_than_an_epoch_needs_is_kept_to(tmp_path: Path, data: Path, ultralytics: StandIn) -> None:
