@@ -86,7 +86,7 @@ def train_yolo(arch: YoloArch, config: TrainingConfig, image_size: int = 640) ->
     ultralytics = _ultralytics(arch, folder / "settings")
     data = prepare_yolo(config.data, folder / "data")
     keep_classes(config, data.classes)
-    progress = _read(folder / KEPT / PROGRESS)
+    progress = _read(folder / KEPT)
     if progress.epochs < planned_epochs(progress, config.minutes):
         _learn(ultralytics, arch, config, image_size, data, folder, progress)
     best = ultralytics.YOLO(str(folder / KEPT / "best.pt"))
@@ -102,7 +102,6 @@ def _ultralytics(arch: str, settings: Path) -> Any:
     """The package, offline and with settings of its own. It reads these variables when it is first imported."""
     os.environ.update(YOLO_OFFLINE="1", YOLO_AUTOINSTALL="0", YOLO_CONFIG_DIR=str(settings))
     os.environ.pop("ULTRALYTICS_API_KEY", None)
-    _give_fonts(settings / "Ultralytics")
     try:
         package = importlib.import_module("ultralytics")
         package.YOLO  # noqa: B018 - is loaded at its first mention
@@ -112,6 +111,7 @@ def _ultralytics(arch: str, settings: Path) -> Any:
         raise StageError("arch", arch, f"ultralytics is not installed; {INSTALL}") from error
     except Exception as error:  # of whatever it loads: torch and torchvision that do not fit, OpenCV without a display
         raise StageError("arch", arch, f"ultralytics cannot be loaded: {error}; {INSTALL}") from error
+    _give_fonts(settings / "Ultralytics")
     package.settings.update({name: False for name in UPLOADS if name in package.settings})
     return package
 
@@ -186,11 +186,12 @@ class _Schedule:
         """Copy checkpoints: ultralytics writes them in place, and strips them when it has ended."""
         if trainer.fitness == trainer.best_fitness:
             _copy(Path(trainer.best), self._kept / "best.pt")
-        _copy(Path(trainer.last), self._kept / "last.pt")
-        text = json.dumps(asdict(YoloProgress(trainer.epoch + 1, self._seconds())))
+        # Not after last.pt: of a training that has ended there would be nothing to resume, though it seemed so.
+        self._kept.mkdir(exist_ok=True)
         part = self._kept / f"{PROGRESS}.part"
-        part.write_text(text + "\n", encoding="utf-8")
+        part.write_text(json.dumps(asdict(YoloProgress(trainer.epoch + 1, self._seconds()))) + "\n", encoding="utf-8")
         part.replace(self._kept / PROGRESS)
+        _copy(Path(trainer.last), self._kept / "last.pt")
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -200,11 +201,13 @@ def _copy(source: Path, target: Path) -> None:
     part.replace(target)
 
 
-def _read(path: Path) -> YoloProgress:
-    if not path.is_file():
+def _read(kept: Path) -> YoloProgress:
+    """Of the checkpoint that is kept, if there is one."""
+    path = kept / PROGRESS
+    if not (kept / "last.pt").is_file():
         return YoloProgress()
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return YoloProgress(int(content["epochs"]), float(content["seconds"]))
-    except (KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise FileFormatError(path, "epochs, seconds", f"cannot be read: {error}; choose another --out") from error

@@ -65,7 +65,8 @@ class Network:
         weights.mkdir(exist_ok=True)
         trainer = SimpleNamespace(
             args=SimpleNamespace(epochs=arguments.get("epochs", 1), close_mosaic=10),
-            epochs=arguments.get("epochs", 1), stop=False, best=weights / "best.pt", last=weights / "last.pt", best_fitness=None, fitness=None,
+            epochs=arguments.get("epochs", 1), stop=False, best_fitness=None, fitness=None,
+            best=weights / "best.pt", last=weights / "last.pt",
         )  # fmt: skip
         self._tell("on_pretrain_routine_start", trainer)
         assert first < trainer.epochs == trainer.args.epochs, "nothing to resume"
@@ -180,6 +181,30 @@ def test_it_carries_on_from_the_last_whole_checkpoint(
     assert json.loads((tmp_path / "yolov8s-pose.onnx").read_text()) == {"epoch": 0}
 
 
+@pytest.mark.parametrize("written", range(13))
+def test_killed_while_a_checkpoint_is_kept_it_carries_on(
+    tmp_path: Path, data: Path, ultralytics: StandIn, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    """After any of the 13 files that six epochs keep: three of the first, which is the best, two of each other."""
+    config = TrainingConfig(data, tmp_path, minutes=0.4)
+    replace, left = Path.replace, [written]
+
+    def replaced(path: Path, target: Path) -> Path:
+        if target.parent.name == "kept":
+            if not left[0]:
+                raise KeyboardInterrupt
+            left[0] -= 1
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", replaced)
+    with pytest.raises(KeyboardInterrupt):
+        train_yolo("yolov8s-pose", config)
+    left[0] = 1000
+    train_yolo("yolov8s-pose", config)
+    assert json.loads((tmp_path / "yolov8s-pose.onnx").read_text()) == {"epoch": 0}
+    assert ultralytics.epochs_ever in (5, 6)
+
+
 def test_what_has_learned_learns_on_with_more_time_alone(tmp_path: Path, data: Path, ultralytics: StandIn) -> None:
     for minutes, epochs in ((0.4, 6), (0.4, 6), (0.2, 6), (1.0, 15), (None, EPOCHS), (None, EPOCHS)):
         train_yolo("yolov8s-pose", TrainingConfig(data, tmp_path, minutes=minutes))
@@ -210,6 +235,7 @@ def test_sizes_other_folders_and_damaged_progress_are_refused(tmp_path: Path, da
     kept = tmp_path / "yolov8s-pose" / "kept"
     kept.mkdir()
     (kept / "progress.json").write_text("{}")
+    (kept / "last.pt").write_text("")
     with pytest.raises(FileFormatError, match="epochs, seconds: cannot be read"):
         train_yolo("yolov8s-pose", TrainingConfig(data, tmp_path))
     assert not ultralytics.calls
