@@ -23,6 +23,20 @@ from tests.training.yolo_data import contents, write_yolo_dataset
 ROOT = Path(__file__).parents[2]
 PYTHON = os.environ.get("SIMTRACK_ULTRALYTICS_PYTHON", sys.executable)
 """An interpreter that has ultralytics, which wants an environment of its own."""
+WATCH = """
+import os, socket
+
+def told(name):
+    def asked(*arguments, **others):
+        with open(os.environ["ASKED"], "a") as stream:
+            stream.write(f"{name} {arguments}\\n")
+        raise OSError("there is no network")
+    return asked
+
+socket.getaddrinfo = told("getaddrinfo")
+socket.socket.connect = told("connect")
+"""
+"""Writes down who asks for the network, and refuses."""
 BATCHES, SECONDS = 4, 1.0
 """Of an epoch of the stand-in, and a batch."""
 
@@ -272,8 +286,16 @@ def test_the_real_one_trains_and_its_network_finds_what_it_finds(tmp_path: Path,
         pytest.skip(f"{PYTHON} has no ultralytics that can be loaded, with onnx and onnxruntime")
     before, home = contents(data), tmp_path / "home"
     home.mkdir()
-    environment |= {"HOME": str(home)}
-    environment.pop("YOLO_CONFIG_DIR")
+    site, asked = tmp_path / "site", tmp_path / "asked.txt"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(WATCH)
+    environment |= {"HOME": str(home), "PYTHONPATH": f"{site}{os.pathsep}{ROOT}", "ASKED": str(asked)}
+    for name in settings:
+        environment.pop(name)
+    look_up = "import socket; socket.getaddrinfo('localhost', 80)"
+    subprocess.run([PYTHON, "-c", look_up], env=environment, capture_output=True)
+    assert asked.read_text()  # the watch works
+    asked.unlink()
 
     def train(minutes: float) -> str:
         options = ["--arch", "yolov8n-pose", "--image-size", "64", "--minutes", str(minutes)]
@@ -310,3 +332,4 @@ assert found.status is Status.OK and found.detections[0].keypoints.shape == (9, 
     subprocess.run([PYTHON, "-c", code, str(path)], check=True, env=environment, cwd=ROOT)
     assert contents(data) == before
     assert not [path for path in home.rglob("*") if "ltralytics" in path.name]
+    assert not asked.exists(), asked.read_text()
