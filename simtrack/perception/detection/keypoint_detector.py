@@ -56,13 +56,13 @@ class KeypointDetectorConfig:
     """Boxes with a lower score are not looked at."""
     present: float = 0.98
     """Windows in which the object is with less probability than this are dropped."""
-    hint: float = 0.1
+    hint: float = 0.2
     """Boxes with at least this score are looked at, too, and regions that nothing explains with such a centre ..."""
     hints: int = 12
     """... at most so many, those with the highest scores, which are dropped ..."""
     weak_present: float = 0.9995
     """... if the object is in the box with less probability than this ..."""
-    region_present: float = 0.99
+    region_present: float = 0.999
     """... or in the region with less than this."""
     same: float = 0.15
     """Detections of a class whose keypoints' centres are nearer to each other than this are of one object, in shares of

@@ -65,11 +65,17 @@ class FitConfig:
 
 
 def cost(result: RegistrationResult, gate: float = 0.012) -> float:
-    """Mean squared residual of a registered pose, seen-through rays counting as `gate` metres; lower is better, m^2."""
+    """Mean squared residual of a registered pose, seen-through rays counting as a large one; lower is better, m^2.
+
+    Args:
+        result: of the registration.
+        gate: that residual, metres, at 1 m distance; it grows with its square, as the errors of depth do.
+    """
     seen = result.supported + result.missing
     if seen == 0:
         return np.inf
-    return (result.residual**2 * result.supported + gate**2 * result.missing) / seen
+    large = gate * max(1.0, float(result.T_camera_object[2, 3])) ** 2
+    return (result.residual**2 * result.supported + large**2 * result.missing) / seen
 
 
 def believable(result: RegistrationResult, config: FitConfig) -> bool:

@@ -35,9 +35,9 @@ class OracleDetectorConfig:
     own scale, as a network does."""
     correlation: float = 0.17
     """Share of the keypoints' error variance that is common to one detection (shift, scale, turn)."""
-    miss_rate: float = 0.005
+    miss_rate: float = 0.003
     """Share of large, wholly visible objects that are not found in an image."""
-    hard_misses: float = 1.0
+    hard_misses: float = 0.9
     """Times (1 - visible)^2, and times (min_size / size)^2: shares that are missed for being hidden and small."""
     false_positive_rate: float = 0.027
     """Detections of nothing per true detection."""
@@ -47,7 +47,7 @@ class OracleDetectorConfig:
     """Seconds from the image's stamp to the answer."""
     min_visible: float = 0.1
     """Objects of which less is visible are never found."""
-    min_size: float = 14.0
+    min_size: float = 8.0
     """Objects smaller than this in the image are never found, pixels."""
     occlusion_growth: float = 2.5
     """Errors grow with exp(occlusion_growth (1 - visible))."""

@@ -9,7 +9,8 @@ from simtrack.contracts import Float32, Float64, PoseHypothesis
 from simtrack.geometry.transforms import angle_between, exp_so3, transform
 from simtrack.objects import load_object
 from simtrack.perception.detection.pnp import project_points
-from simtrack.perception.tracking.birth import FitConfig, Prober
+from simtrack.perception.tracking.birth import FitConfig, Prober, cost
+from simtrack.perception.tracking.registration import RegistrationResult
 from simtrack.perception.tracking.registration_config import RegistrationConfig
 from simtrack.perception.tracking.target import tracked_model
 from tests.perception.tracking.scenes import INTRINSICS, BenchWorld, in_camera, on_bench
@@ -75,3 +76,20 @@ def test_what_is_in_a_hand_is_not_registered_to_the_hand(held: Float32, prober: 
     assert len(right) >= 3
     assert all(off(result.T_camera_object)[0] < 0.005 and off(result.T_camera_object)[1] < 3.0 for result in right)
     assert sum(result is not None for result in wide) < len(right), "wide gates take the hand for the object"
+
+
+@pytest.mark.parametrize("distance", [0.8, 1.0, 2.0, 3.5])
+def test_a_fit_that_is_seen_through_costs_as_much_at_any_distance(distance: float) -> None:
+    """Beside one that is not: depth errors grow with the square of the distance, costs with its fourth power."""
+
+    def fit(missing: int) -> RegistrationResult:
+        residual = 0.0015 * max(1.0, distance) ** 2
+        T = transform(translation=(0.0, 0.0, distance))
+        return RegistrationResult(T, np.eye(6), 6, 400, 400 - missing, 0, missing, 0, 1, residual, 0.8, 40)
+
+    assert cost(fit(40)) / cost(fit(12)) == pytest.approx(2.5, abs=0.1)
+
+
+def test_what_was_not_seen_at_all_costs_everything() -> None:
+    nothing = RegistrationResult(np.eye(4), np.eye(6), 0, 10, 0, 10, 0, 0, 1, 0.0, 0.0, 0)
+    assert cost(nothing) == np.inf
