@@ -57,10 +57,12 @@ class KeypointDetectorConfig:
     present: float = 0.98
     """Windows in which the object is with less probability than this are dropped."""
     hint: float = 0.2
-    """Boxes with at least this score are looked at, too, and regions that nothing explains with such a centre ..."""
+    """Boxes with at least this score are looked at, too, ..."""
+    region_hint: float = 0.05
+    """... and regions that nothing explains with such a centre ..."""
     hints: int = 12
     """... at most so many, those with the highest scores, which are dropped ..."""
-    weak_present: float = 0.9995
+    weak_present: float = 0.9999
     """... if the object is in the box with less probability than this ..."""
     region_present: float = 0.999
     """... or in the region with less than this."""
@@ -137,7 +139,7 @@ class KeypointDetector:
         hints = [(box, config.weak_present) for box in boxes[len(clear) :]]
         hints += [
             (box, config.region_present)
-            for box in boxes_of_regions(heat, unexplained, scale, config.hint)
+            for box in boxes_of_regions(heat, unexplained, scale, config.region_hint)
             if self._diameters[box.class_index]
         ]
         looked = clear + sorted(hints, key=lambda hint: -hint[0].score)[: config.hints]

@@ -32,7 +32,7 @@ from simtrack.perception.tracking.association import (
     nearest_equivalent,
     rotation_apart,
 )
-from simtrack.perception.tracking.birth import Occluders, Prober, cost
+from simtrack.perception.tracking.birth import Occluders, Prober, believable, cost
 from simtrack.perception.tracking.claims import Claim, ClaimQueue, Views
 from simtrack.perception.tracking.correspondences import usable_depth
 from simtrack.perception.tracking.filter import Measurement, PoseFilter
@@ -48,6 +48,9 @@ from simtrack.perception.tracking.target import (
     tracked_model,
 )
 from simtrack.perception.tracking.trace import RegistrationTrace
+
+SAME_PLACE = 0.2
+"""Boxes of objects have at most this share in common, unless one of the objects is not there."""
 
 
 class ObjectTracker:
@@ -324,6 +327,10 @@ class ObjectTracker:
         T_camera_object = inverse(view.T_map_camera) @ target.filter.pose_at(view.stamp)
         model, around = self._tracked[target.model.name], self._around(view, but=target)
         holder = self._prober.judge(T_camera_object, model, view.depth, view.intrinsics, around)
+        if holder is not None and self._both_there(holder, challenger.fit, target, view):
+            target.disagreements = 0  # two of a kind, side by side
+            self._bear(Claim(claim.group, view, None), challenger)
+            return
         # The more often detections have contradicted a pose, the better it has to fit to stay.
         margin = 1.3 / max(1.0, 0.5 * target.disagreements)
         if holder is not None and cost(holder) < margin * cost(challenger.fit):
@@ -333,13 +340,22 @@ class ObjectTracker:
             state = challenger.filter
             target.filter, target.last_seen, target.disagreements = state, state.state.stamp, 0
 
+    def _both_there(self, a: RegistrationResult, b: RegistrationResult, target: Target, view: View) -> bool:
+        """Whether two poses of a target's model are believable each, and explain different measurements."""
+        model = self._tracked[target.model.name]
+        extents, poses = target.model.extents, (a.T_camera_object, b.T_camera_object)
+        if not believable(a, self.config.fit) or box_overlap(poses[0], extents, poses[1], extents) >= SAME_PLACE:
+            return False
+        shared = self._prober.shared(poses[1], model, poses[0], model, view.depth, view.intrinsics)
+        return shared < self.config.shared_surface
+
     def _bear(self, claim: Claim, candidate: Candidate) -> None:
         """Make a detection that no track explains a track: a registered hypothesis of it is believable."""
         group, view, model, result = claim.group, claim.view, self._models[claim.class_name], candidate.fit
         T_map_object = view.T_map_camera @ result.T_camera_object
         for other in list(self._targets):
             T_other = other.filter.pose_at(view.stamp)
-            if not other.alive or box_overlap(T_map_object, model.extents, T_other, other.model.extents) < 0.2:
+            if not other.alive or box_overlap(T_map_object, model.extents, T_other, other.model.extents) < SAME_PLACE:
                 continue
             T_camera_other = inverse(view.T_map_camera) @ T_other
             if other.model is model:

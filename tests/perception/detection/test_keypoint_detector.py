@@ -130,9 +130,9 @@ def test_weak_centres_want_surer_windows(opened: dict[str, Any]) -> None:
     answers, image = opened["answers"]["instance"], frame(np.zeros((480, 640, 3), np.uint8))
     for centre, present, count in (
         (4.0, 4.5, 1),  # scores of 0.98 and 0.989
-        (-1.2, 7.0, 0),  # 0.23 and 0.9991
-        (-1.2, 8.0, 1),  # 0.9997
-        (-2.0, 8.0, 0),  # 0.12
+        (-1.2, 8.0, 0),  # 0.23 and 0.9997
+        (-1.2, 10.0, 1),  # 0.99995
+        (-2.0, 10.0, 0),  # 0.12
     ):
         answers.centre, answers.present = centre, present
         assert len(KeypointDetector(models(), Path("x")).detect(image).detections) == count
