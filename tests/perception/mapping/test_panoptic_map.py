@@ -414,3 +414,16 @@ def test_what_is_cut_off_from_a_thing_says_nothing_or_background() -> None:
     for silent, expected in ((True, SILENT), (False, 0)):
         fused = fuse_segments(geometric, panoptic, depth, CAMERA, config=FrameFusionConfig(silent=silent))
         assert fused.instances[fused.image[0, 150]] == expected
+
+
+def test_the_ablation_splits_masks_out_of_what_contains_them_and_leaves_the_rest_to_the_background() -> None:
+    depth, geometric = flat_scene()
+    config = PanopticMapConfig.of_method("no-joint-fusion").fusion
+    for left, splits in ((10, True), (60, False)):  # the mask lies in the wall, and with 25 of 40 columns on it
+        image = np.zeros((120, 160), np.int32)
+        image[45:75, left : left + 40] = 1
+        picture = PanopticSegments(0, image, ("picture",), np.ones(1, np.float32))
+        fused = fuse_segments(geometric, picture, depth, CAMERA, {"wall"}, config)
+        assert (fused.instances[fused.image[60, left + 5]] == 1) == splits
+        assert fused.instances[fused.image[5, 5]] == 0
+        assert SILENT not in fused.instances

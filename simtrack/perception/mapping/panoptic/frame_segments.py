@@ -71,6 +71,18 @@ class FrameFusionConfig:
         if self.min_pixels < 1:
             raise InvalidValueError("FrameFusionConfig.min_pixels", self.min_pixels, "1 or more")
 
+    @staticmethod
+    def of_paper() -> "FrameFusionConfig":
+        """Section 3.1 alone: masks are split out of segments that contain them, what is not in the largest cluster of a
+        thing is background, and nothing is filled in or held to planes.
+        """
+        return FrameFusionConfig(inside=0.9, fill=False, silent=False, hidden=(0.0, 0.0), flat=False)
+
+    @staticmethod
+    def of_voxbloxpp() -> "FrameFusionConfig":
+        """Geometric segments take the mask that covers most of them, and that is all."""
+        return FrameFusionConfig(split=False, fill=False, cluster=False, flat=False)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSegments:

@@ -67,9 +67,9 @@ class PanopticMapConfig:
     def of_method(method: Method, voxel: float = 0.02) -> "PanopticMapConfig":
         """The settings of a method of the reconstruction paper's Table 2.
 
-        ``full``; ``no-joint-fusion``, the ablation, which counts classes and instances separately, and takes what its
-        counts say for the entities, as both papers do; ``voxbloxpp``, which besides neither splits nor clusters the
-        segments of a frame.
+        ``full``; ``no-joint-fusion``, the ablation: segments of a frame as in the paper's section 3.1, classes and
+        instances counted separately, and what the counts say for the entities, as both papers do; ``voxbloxpp``, which
+        besides neither splits nor clusters the segments of a frame.
 
         Raises:
             InvalidValueError: no such method.
@@ -77,11 +77,10 @@ class PanopticMapConfig:
         if method not in METHODS:
             raise InvalidValueError("method", method, ", ".join(METHODS))
         config = PanopticMapConfig(volume=VolumeConfig(voxel=voxel))
-        if method != "full":
-            config = replace(config, joint=False, entities=EntityConfig.of_counts_alone())
-        if method == "voxbloxpp":
-            config = replace(config, fusion=FrameFusionConfig(split=False, fill=False, cluster=False, flat=False))
-        return config
+        if method == "full":
+            return config
+        fusion = FrameFusionConfig.of_voxbloxpp() if method == "voxbloxpp" else FrameFusionConfig.of_paper()
+        return replace(config, joint=False, entities=EntityConfig.of_counts_alone(), fusion=fusion)
 
 
 @dataclass(frozen=True, slots=True)
