@@ -74,9 +74,9 @@ def mapped_entities(folder: Path) -> SourceEntities:
         FileFormatError, MeshError: a file of it is missing or broken.
     """
     from simtrack.perception.mapping.panoptic.files import read_entities
-    from simtrack.perception.mapping.panoptic.layout import split_walls
+    from simtrack.perception.mapping.panoptic.layout import split_layout
 
-    entities = split_walls(read_entities(folder), np.random.default_rng(0))
+    entities = split_layout(read_entities(folder), np.random.default_rng(0))
     meshes = tuple(EntityMesh(e.name, e.semantic_class, e.mesh) for e in entities)
     return SourceEntities(folder.resolve().name, meshes)
 

@@ -191,10 +191,10 @@ def _contact_graph(
     from simtrack.evaluation.contact_graph import SupportTree, contact_graph_errors, match_by_overlap
     from simtrack.evaluation.reconstruction import true_tree
     from simtrack.geometry.upright_boxes import upright_box
-    from simtrack.perception.mapping.panoptic.layout import split_walls
+    from simtrack.perception.mapping.panoptic.layout import split_layout
     from simtrack.perception.scene_graph.contact import EntityMesh, build_contact_graph, entity_nodes
 
-    split = split_walls(entities, np.random.default_rng(0))
+    split = split_layout(entities, np.random.default_rng(0))
     meshes = [EntityMesh(e.name, e.semantic_class, e.mesh) for e in split]
     nodes, findings = entity_nodes(meshes, np.random.default_rng(0))
     graph = build_contact_graph(nodes, findings=findings)

@@ -16,7 +16,7 @@ from simtrack.perception.mapping.panoptic.counts import CountsConfig, JointCount
 from simtrack.perception.mapping.panoptic.entities import MapEntityMesh, extract_surface
 from simtrack.perception.mapping.panoptic.files import read_entities, write_entities
 from simtrack.perception.mapping.panoptic.frame_segments import SILENT, FrameFusionConfig, fuse_segments
-from simtrack.perception.mapping.panoptic.layout import split_walls
+from simtrack.perception.mapping.panoptic.layout import split_layout
 from simtrack.perception.mapping.panoptic.map_file import read_map, write_map
 from simtrack.perception.mapping.panoptic.panoptic_map import Method, PanopticMap, PanopticMapConfig
 from simtrack.perception.mapping.panoptic.regions import SwapConfig
@@ -243,9 +243,35 @@ def test_walls_are_told_apart() -> None:
         np.concatenate([p.vertices for p in parts]),
         np.concatenate([parts[0].faces, parts[1].faces + 8]).astype(np.int32),
     )
-    split = split_walls([MapEntityMesh("wall1", "wall", 1, 1.0, both)], np.random.default_rng(0))
+    split = split_layout([MapEntityMesh("wall1", "wall", 1, 1.0, both)], np.random.default_rng(0))
     sides = {int(np.argmin(entity.mesh.extents[:2])) for entity in split}
     assert sides == {0, 1} and all(min(entity.mesh.extents[:2]) < 0.05 for entity in split)
+
+
+def joined(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Mesh:
+    """Boxes of these sizes about these middles as one mesh."""
+    meshes = [box_mesh(size) for size, _ in boxes]
+    vertices = np.concatenate([m.vertices + np.array(at) for m, (_, at) in zip(meshes, boxes, strict=True)])
+    faces = np.concatenate([m.faces + 8 * k for k, m in enumerate(meshes)])
+    return Mesh(vertices, faces.astype(np.int32))
+
+
+@pytest.mark.parametrize(("depth", "walls"), [(0.1, 1), (0.6, 2)])
+def test_a_pane_is_part_of_the_wall_that_it_is_sunk_in(depth: float, walls: int) -> None:
+    mesh = joined(((3.0, 0.01, 2.0), (0.0, 0.0, 1.0)), ((1.2, 0.01, 1.0), (0.0, depth, 1.5)))
+    split = split_layout([MapEntityMesh("wall1", "wall", 1, 1.0, mesh)], np.random.default_rng(0))
+    # Of a box both sides are walls, which face away from each other.
+    assert len(split) == 2 * walls
+    assert np.sum([entity.mesh.extents[1] > 0.5 * depth for entity in split]) == (2 if walls == 1 else 0)
+
+
+def test_what_leaked_into_the_floor_is_left_out() -> None:
+    mesh = joined(((3.0, 3.0, 0.01), (0.0, 0.0, 0.0)), ((0.05, 0.05, 0.4), (1.0, 1.0, 0.8)))
+    (floor,) = split_layout([MapEntityMesh("floor1", "floor", 1, 1.0, mesh)], np.random.default_rng(0))
+    assert floor.name == "floor1" and floor.mesh.extents[2] < 0.05
+    np.testing.assert_allclose(floor.mesh.extents[:2], [3.0, 3.0], atol=1e-6)
+    leaked = joined(((0.05, 0.05, 0.4), (1.0, 1.0, 0.8)))  # no floor in it: as it was
+    assert split_layout([MapEntityMesh("floor1", "floor", 1, 1.0, leaked)], np.random.default_rng(0))[0].mesh is leaked
 
 
 # ----------------------------------------------------------------------------------------------- saved and swapped out
