@@ -62,10 +62,8 @@ class KeypointDetectorConfig:
     """... and regions that nothing explains with such a centre ..."""
     hints: int = 12
     """... at most so many, those with the highest scores, which are dropped ..."""
-    weak_present: float = 0.9999
-    """... if the object is in the box with less probability than this ..."""
-    region_present: float = 0.999
-    """... or in the region with less than this."""
+    hint_present: float = 0.9999
+    """... if the object is in them with less probability than this."""
     same: float = 0.15
     """Detections of a class whose keypoints' centres are nearer to each other than this are of one object, in shares of
     a box's side."""
@@ -136,13 +134,13 @@ class KeypointDetector:
         boxes = self._decoded(heat, sides, scale, min(config.hint, config.box_score))
         clear = [(box, config.present) for box in boxes if box.score > config.box_score]
         unexplained = [region.box for region in regions if region.sensor == "camera"]
-        hints = [(box, config.weak_present) for box in boxes[len(clear) :]]
-        hints += [
-            (box, config.region_present)
+        hints = boxes[len(clear) :] + [
+            box
             for box in boxes_of_regions(heat, unexplained, scale, config.region_hint)
             if self._diameters[box.class_index]
         ]
-        looked = clear + sorted(hints, key=lambda hint: -hint[0].score)[: config.hints]
+        hints = sorted(hints, key=lambda hint: -hint.score)[: config.hints]
+        looked = clear + [(box, config.hint_present) for box in hints]
         answers = self._closer([box for box, _ in looked], frame.rgb, frame.depth, frame.intrinsics.fx)
         found = [
             (k >= len(clear), answer)

@@ -171,7 +171,8 @@ class ObjectTracker:
     def _measure(self, target: Target, view: View, result: RegistrationResult, jump: float) -> None:
         """Fuse an accepted registration."""
         gap = view.stamp - target.last_seen > self.config.unseen_gap * NANOSECONDS
-        if gap and target.known and jump > self.config.displaced and target.vague(self.config):
+        settled = target.status is not TrackStatus.TENTATIVE
+        if settled and gap and target.known and jump > self.config.displaced and target.vague(self.config):
             # It was moved while nobody looked, and its surface alone does not tell how: detections have to.
             self._demote(target, view.stamp)
         taken = measurement(view, result, target.last_seen, self.config)
@@ -293,7 +294,9 @@ class ObjectTracker:
         nearest = group[int(np.argmin(apart))]
         limit = self.config.doubt if target.doubtful(self.config) else self.config.disagreement
         aside = beside(nearest.T_camera_object, T_camera_object) > self.config.beside * target.model.diameter
-        if min(apart) <= limit and not aside:
+        # Demoted, and its registrations are not believed either: the detection is to say where it is.
+        adrift = target.status is TrackStatus.TENTATIVE and target.known and target.doubts > 0
+        if min(apart) <= limit and not aside and not adrift:
             target.disagreements = 0
             target.detections += 1
             target.score = min(0.99, target.score + 0.1)
@@ -339,6 +342,7 @@ class ObjectTracker:
         if not challenger.lost:
             state = challenger.filter
             target.filter, target.last_seen, target.disagreements = state, state.state.stamp, 0
+            target.doubts, target.detections = 0, target.detections + 1
 
     def _both_there(self, a: RegistrationResult, b: RegistrationResult, target: Target, view: View) -> bool:
         """Whether two poses of a target's model are believable each, and explain different measurements."""

@@ -46,7 +46,7 @@ CLASSES = {"classes": ["brick", "tile"], "extents": [[0.2, 0.12, 0.08], [0.1, 0.
 class Answers:
     """Networks that know the answer for one object of the first class."""
 
-    def __init__(self, T_camera_object: np.ndarray, present: float = 8.0) -> None:
+    def __init__(self, T_camera_object: np.ndarray, present: float = 10.0) -> None:
         self.keypoints = project_points(T_camera_object, brick().keypoints, CAMERA)
         self.box = np.concatenate([self.keypoints.min(axis=0), self.keypoints.max(axis=0)])
         self.present = present

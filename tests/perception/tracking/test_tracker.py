@@ -101,6 +101,21 @@ def test_birth_tracking_and_identity_of_two_of_a_class() -> None:
     film.tracker.close()
 
 
+def test_detections_of_one_of_two_side_by_side_leave_the_other_its_track() -> None:
+    """Of two screwdrivers 8 cm apart the detector finds one at first, then for long the other alone."""
+    film = Film("screwdriver")
+    first, second = film.put("screwdriver", 0.0, 0.0, 1.7), film.put("screwdriver", 0.08, 0.0, 1.7)
+    film.visible = {first}
+    (before,) = film.run(15).tracks
+    film.visible = {second}
+    tracks = {track.id: track for track in film.run(60).tracks}
+    assert len(tracks) == 2
+    assert tracks[before.id].status is TrackStatus.CONFIRMED
+    (other,) = (track for track in tracks.values() if track.id != before.id)
+    for track, instance in ((tracks[before.id], first), (other, second)):
+        assert np.linalg.norm(track.T_map_object[:3, 3] - film.poses[instance][1][:3, 3]) < 0.01
+
+
 def test_occluded_is_kept_and_gone_is_lost_and_found_again() -> None:
     film = Film("powerdrill")
     drill = film.put("powerdrill", 0.0, 0.0, 0.5)
