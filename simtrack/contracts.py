@@ -243,6 +243,8 @@ class DetectionResult:
     """Nanoseconds: simulated or recorded time at which the answer is there (stamp plus latency)."""
     detections: tuple[Detection, ...]
     status: Status = Status.OK
+    next_image: int | None = None
+    """Nanoseconds: the detector takes no image before this time; None: none before its answer is there."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -319,6 +319,7 @@ def _joint_state(message: Any) -> JointState:
 
 
 def _detections(message: Any) -> DetectionResult:
+    next_image = getattr(message, "next_image", message.available)  # recordings of before there was one lack it
     return DetectionResult(
         stamp=_stamp(message.header),
         available=message.available,
@@ -333,4 +334,5 @@ def _detections(message: Any) -> DetectionResult:
             for entry in message.detections
         ),
         status=Status(message.status),
+        next_image=None if next_image == message.available else next_image,
     )

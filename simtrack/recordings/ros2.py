@@ -58,7 +58,9 @@ _MESSAGES = {
     "simtrack_msgs/Detection": (
         "string class_name\nfloat64[18] keypoints\nfloat64[9] keypoint_sigma\nfloat64[4] box\nfloat64 score\n"
     ),
-    "simtrack_msgs/Detections": "std_msgs/Header header\nint64 available\nstring status\nDetection[] detections\n",
+    "simtrack_msgs/Detections": (
+        "std_msgs/Header header\nint64 available\nint64 next_image\nstring status\nDetection[] detections\n"
+    ),
 }
 
 VELODYNE_POINT = np.dtype(
@@ -220,8 +222,9 @@ def frame_record(stamp: int, sequence: int, pose: Float64, frame_id: str) -> byt
 
 
 def detections(result: DetectionResult, frame_id: str) -> bytes:
-    """`simtrack_msgs/Detections`: pixels; header = stamp of the image, `available` in nanoseconds."""
-    cdr = _Cdr().header(result.stamp, frame_id).pack("q", result.available).string(str(result.status))
+    """`simtrack_msgs/Detections`: pixels; header = stamp of the image, `available` and `next_image` in nanoseconds."""
+    cdr = _Cdr().header(result.stamp, frame_id).pack("q", result.available)
+    cdr.pack("q", result.available if result.next_image is None else result.next_image).string(str(result.status))
     cdr.pack("I", len(result.detections))
     for detection in result.detections:
         cdr.string(detection.class_name).array(detection.keypoints).array(detection.keypoint_sigma)

@@ -89,7 +89,9 @@ def detection_result(rng: np.random.Generator, stamp: int, count: int = 2) -> De
         )
         for index in range(count)
     )
-    return DetectionResult(stamp, stamp + 150_000_001, detections, Status.DEGRADED if count else Status.NO_DATA)
+    return DetectionResult(
+        stamp, stamp + 150_000_001, detections, Status.DEGRADED if count else Status.NO_DATA, stamp + 2 * 10**8
+    )
 
 
 def feed(rng: np.random.Generator, frames: int, size: tuple[int, int] = (6, 8)) -> list[Entry]:

@@ -152,3 +152,4 @@ def test_joint_states_and_detections(log: tuple[Path, list[Any]], decoded: dict[
     _, answer = decoded[layout.DETECTIONS][1]
     assert [len(d.keypoints) for d in answer.detections] == [18, 18]
     assert answer.available == stamp(answer) + 150_000_001
+    assert answer.next_image == stamp(answer) + 200_000_000

@@ -50,8 +50,10 @@ EXTENT_TOLERANCE = 0.15
 class KeypointDetectorConfig:
     """Settings of `KeypointDetector`."""
 
-    latency: float = 0.2
-    """Seconds of simulated or recorded time from the image's stamp to the answer. The next image is taken then."""
+    rate: float = 5.0
+    """Images that are taken a second of simulated or recorded time, at most."""
+    latency: float = 0.1
+    """Seconds of that time from the image's stamp to the answer. No image is taken before."""
     box_score: float = 0.4
     """Boxes with a lower score are not looked at."""
     present: float = 0.98
@@ -73,6 +75,8 @@ class KeypointDetectorConfig:
     """onnxruntime answers with the same bits everywhere; OpenVINO may be faster."""
 
     def __post_init__(self) -> None:
+        if not self.rate > 0.0:
+            raise InvalidValueError("KeypointDetectorConfig.rate", self.rate, "> 0 Hz")
         for field in fields(self):
             if field.name != "runtime" and not getattr(self, field.name) >= 0.0:
                 raise InvalidValueError(f"KeypointDetectorConfig.{field.name}", getattr(self, field.name), ">= 0")
@@ -127,6 +131,7 @@ class KeypointDetector:
         where objects overlap, that takes them for one.
         """
         available = frame.stamp + int(self.config.latency * NANOSECONDS)
+        next_image = max(frame.stamp + int(NANOSECONDS / self.config.rate), available)
         if frame.rgb is None:
             return DetectionResult(frame.stamp, available, (), Status.NO_DATA)
         config = self.config
@@ -148,7 +153,8 @@ class KeypointDetector:
             if there >= least
         ]
         found.sort(key=lambda pair: (pair[0], -pair[1].score))
-        return DetectionResult(frame.stamp, available, tuple(self._unlike([detection for _, detection in found])))
+        detections = tuple(self._unlike([detection for _, detection in found]))
+        return DetectionResult(frame.stamp, available, detections, next_image=next_image)
 
     def _unlike(self, found: Sequence[Detection]) -> list[Detection]:
         """Those of detections that are not of the same object as an earlier one."""

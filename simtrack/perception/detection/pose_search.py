@@ -217,7 +217,7 @@ class PoseSearch:
         counts = np.zeros((count, correspondences.FIELDS), np.int64)
         pairs = correspondences.point_correspondences(
             np.tile(grid.pixels, count), np.tile(grid.directions, (count, 1)), distances.ravel(), normals, rows,
-            e.depth, e.intrinsics.width, np.ones(count, np.int64), gate, 0.0, REGISTRATION.model_sigma,
+            e.depth, e.intrinsics.width, np.ones(count, np.int64), gate, 1.0, 0.0, REGISTRATION.model_sigma,
             REGISTRATION.focal_baseline, 0.4 / e.camera[0], np.zeros(3), points, 0, counts,
         )  # fmt: skip
         return pairs, counts, distances

@@ -40,6 +40,10 @@ class RunnerConfig:
             raise InvalidValueError("RunnerConfig.patience, timeout", (self.patience, self.timeout), "> 0 s")
 
 
+CLOCK = 1000
+"""Nanoseconds by which frames may be early: their stamps are rounded."""
+
+
 class DetectorRunner:
     """Hands one image at a time to a detector and gives out its answers when they are due.
 
@@ -66,7 +70,7 @@ class DetectorRunner:
 
     def due(self, stamp: int) -> bool:
         """Whether the detector would take an image with this stamp."""
-        return self._free_at is None or stamp >= self._free_at
+        return self._free_at is None or stamp + CLOCK >= self._free_at
 
     def submit(self, frame: RgbdFrame, regions: Sequence[RegionOfInterest] = ()) -> DetectionResult | None:
         """Start on an image; returns the answer that will be due later (for recordings), None if there is none."""
@@ -79,7 +83,8 @@ class DetectorRunner:
         if result.available > latest:
             self.status = Status.DEGRADED
             return None
-        self.status, self._free_at = result.status, max(result.available, frame.stamp + 1)
+        next_image = result.available if result.next_image is None else result.next_image
+        self.status, self._free_at = result.status, max(next_image, frame.stamp + CLOCK + 1)
         if self._solver is None:
             self._solver = worker("poses", threads=self._threads)
         # Until the answer is due there is time to look for the poses.
@@ -89,8 +94,8 @@ class DetectorRunner:
 
     def collect(self, now: int) -> list[PoseHypothesis]:
         """Pose hypotheses of all answers that are due at `now`, nanoseconds."""
-        due = [w for w in self._waiting if w[0].available <= now]
-        self._waiting = [w for w in self._waiting if w[0].available > now]
+        due = [w for w in self._waiting if w[0].available <= now + CLOCK]
+        self._waiting = [w for w in self._waiting if w[0].available > now + CLOCK]
         return [hypothesis for _, hypotheses in due for hypothesis in hypotheses.result()]
 
     def close(self) -> None:

@@ -128,6 +128,8 @@ def wrong_detections(result: object, stamp: int) -> str:
         return f"the stamp is {result.stamp}, that of the frame is {stamp}"
     if result.available < stamp:
         return f"available = {result.available} lies before the image's stamp {stamp}"
+    if result.next_image is not None and result.next_image < stamp:
+        return f"next_image = {result.next_image} lies before the image's stamp {stamp}"
     for number, detection in enumerate(result.detections):
         if not isinstance(detection, Detection):
             return f"detections hold {_kind(detection)}, not a Detection"

@@ -104,10 +104,10 @@ def frame(rgb: np.ndarray | None) -> RgbdFrame:
 
 
 def test_right_answers_become_the_right_pose(opened: dict[str, Any]) -> None:
-    detector = KeypointDetector(models(), Path("somewhere"), KeypointDetectorConfig(latency=0.3))
+    detector = KeypointDetector(models(), Path("somewhere"), KeypointDetectorConfig(rate=2.0, latency=0.3))
     assert isinstance(detector, Detector)
     result = detector.detect(frame(np.zeros((480, 640, 3), np.uint8)))
-    assert (result.stamp, result.available) == (7 * NANOSECONDS, 7_300_000_000)
+    assert (result.stamp, result.available, result.next_image) == (7 * NANOSECONDS, 7_300_000_000, 7_500_000_000)
     (detection,) = result.detections
     assert detection.class_name == "brick"
     answers = opened["answers"]["instance"]
@@ -200,6 +200,8 @@ def test_files_that_are_no_networks_are_refused(tmp_path: Path) -> None:
 def test_settings_are_checked() -> None:
     with pytest.raises(InvalidValueError, match="latency"):
         KeypointDetectorConfig(latency=-1.0)
+    with pytest.raises(InvalidValueError, match="rate"):
+        KeypointDetectorConfig(rate=0.0)
 
 
 def test_the_networks_that_come_along_know_the_workbench() -> None:

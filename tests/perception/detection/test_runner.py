@@ -21,6 +21,7 @@ def _frame(stamp: int) -> RgbdFrame:
 @dataclass
 class Scripted:
     latency: float = 0.1
+    rate: float | None = None
     classes: tuple[str, ...] = ("relay",)
     error: Exception | None = None
     hang: threading.Event | None = None
@@ -34,7 +35,8 @@ class Scripted:
             self.hang.wait(30.0)
         pixels = project_points(T, MODELS["relay"].keypoints, K)
         found = tuple(Detection(c, pixels, np.ones(9), np.zeros(4), 0.9) for c in self.classes)
-        return DetectionResult(frame.stamp, frame.stamp + int(self.latency * NANOSECONDS), found)
+        next_image = None if self.rate is None else frame.stamp + int(NANOSECONDS / self.rate)
+        return DetectionResult(frame.stamp, frame.stamp + int(self.latency * NANOSECONDS), found, next_image=next_image)
 
 
 def test_answers_come_when_they_are_due_and_one_image_is_worked_on_at_a_time() -> None:
@@ -47,6 +49,21 @@ def test_answers_come_when_they_are_due_and_one_image_is_worked_on_at_a_time() -
     assert {h.stamp for h in hypotheses} == {0}
     assert runner.due(NANOSECONDS // 10)
     assert runner.collect(NANOSECONDS) == []
+
+
+def test_a_detector_may_take_images_at_a_rate_of_its_own() -> None:
+    """Whether it works at several images at once or rests in between; stamps of frames are whole nanoseconds."""
+    stamps = [k * (NANOSECONDS // 30) for k in range(31)]
+    for latency, rate, images, waits in ((0.1, 5.0, 6, 3), (0.2, 10.0, 11, 6), (0.2, None, 6, 6)):
+        runner = DetectorRunner(detector := Scripted(latency, rate), MODELS)
+        answers: list[tuple[int, int]] = []
+        for k, stamp in enumerate(stamps):
+            answers += [(round(h.stamp / stamps[1]), k) for h in runner.collect(stamp)[:1]]
+            if runner.due(stamp):
+                runner.submit(_frame(stamp))
+        assert len(detector.asked) == images
+        assert {answered - asked for asked, answered in answers} == {waits}
+        runner.close()
 
 
 def test_a_detector_that_raises_costs_only_its_answer() -> None:
