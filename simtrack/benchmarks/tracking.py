@@ -144,7 +144,7 @@ class PaperFrame:
             kernels.rows_of(sensor.hits.instances, row, sensor.rows)
             pairs = kernels.point_correspondences(
                 sensor.pixels, sensor.directions, sensor.hits.distances, sensor.hits.normals, sensor.rows,
-                sensor.readings, scenes.CAMERA.width, np.ones(count, np.int64), gate, sensor.sigma, 0.0005,
+                sensor.readings, scenes.CAMERA.width, np.ones(count, np.int64), gate, 1.0, sensor.sigma, 0.0005,
                 self.pixel_noise, 0.4 / self.intrinsics[0], sensor.origin, self.points, pairs, counts,
             )  # fmt: skip
         return pairs

@@ -344,7 +344,7 @@ class ArticulationTracker:
         assert bundle.pixels is not None
         pairs = kernels.point_correspondences(
             bundle.pixels, bundle.directions, hits.distances, hits.normals, rows, view.depth.reshape(-1),
-            view.depth.shape[1], np.array([stride]), gate, 0.0, self.config.sigma, config.focal_baseline,
+            view.depth.shape[1], np.array([stride]), gate, 1.0, 0.0, self.config.sigma, config.focal_baseline,
             0.4 / view.intrinsics.fx, np.zeros(3), self._points, 0, counts,
         )  # fmt: skip
         if pairs == 0:

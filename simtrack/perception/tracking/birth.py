@@ -24,9 +24,9 @@ PROBE = 0
 class FitConfig:
     """When a registered candidate is believed to be there."""
 
-    support: float = 0.8
-    """Least share of its unoccluded rays that must confirm it."""
-    pixels: int = 300
+    support: float = 0.88
+    """Least share of its unoccluded rays that must confirm it; right poses have 0.9 to 1, near and far."""
+    pixels: int = 200
     """Fewest pixels that must confirm it."""
     occluded: float = 0.45
     """Largest share of its rays on which something may stand in front of it."""
@@ -38,14 +38,16 @@ class FitConfig:
     """Fewest silhouette pixels that must have a depth step behind them: a flat side fits any wall."""
     constrained: int = 4
     """Fewest directions that the data must constrain."""
-    rotation_sigma: float = np.deg2rad(4.0)
+    rotation_sigma: float = np.deg2rad(6.0)
     """Largest standard deviation of a constrained orientation, radians: a small thing far away fits in many ways."""
     good_support: float = 0.95
     """A fit with less support than this is tried again from turned starts ..."""
-    good_misfit: float = 1.0
-    """... and so is one with a larger misfit than this."""
-    misfit: float = 1.25
-    """A fit with a larger misfit than this is not believed."""
+    good_misfit: float = 1.2
+    """... and so is one with a larger misfit than this many times that of right poses."""
+    misfit: float = 1.3
+    """A fit with a larger misfit than this many times that of right poses (`NoiseLevel`), plus the share of it that is
+    occluded, is not believed: another thing's surface fits worse. What stands closely before a thing, as fingers do,
+    takes in some of its readings."""
     near_support: float = 0.8
     """Hypotheses with more support than this are registered as they are, and no others are ..."""
     near_margin: float = 0.8
@@ -78,8 +80,8 @@ def cost(result: RegistrationResult, gate: float = 0.012) -> float:
     return (result.residual**2 * result.supported + large**2 * result.missing) / seen
 
 
-def believable(result: RegistrationResult, config: FitConfig) -> bool:
-    """Whether a registered pose is well supported by the measurements."""
+def believable(result: RegistrationResult, config: FitConfig, noise: float) -> bool:
+    """Whether a registered pose is well supported by the measurements; `noise` is the misfit of right poses."""
     z = float(result.T_camera_object[2, 3])
     variances = np.linalg.eigvalsh(result.covariance[3:, 3:])
     known = variances[variances < 1.0]  # unconstrained directions have far larger ones
@@ -87,12 +89,35 @@ def believable(result: RegistrationResult, config: FitConfig) -> bool:
         result.support >= config.support
         and result.supported * result.stride**2 >= config.pixels
         and result.residual <= config.residual * max(1.0, z) ** 2
-        and result.misfit <= config.misfit
+        and fits_noise(result, config, noise)
         and result.edges >= config.edges
         and result.constrained >= config.constrained
         and result.occluded <= config.occluded * result.rays
         and bool(np.all(known <= config.rotation_sigma**2))
     )
+
+
+def fits_noise(result: RegistrationResult, config: FitConfig, noise: float) -> bool:
+    """Whether a registered pose's residuals are those of the sensor, as far as what stands before it allows."""
+    return result.misfit <= config.misfit * noise + result.occluded / max(result.rays, 1)
+
+
+class NoiseLevel:
+    """The misfit of right poses, learned from tracks: what the sensor's noise is of what the registration takes it for.
+
+    A sensor as good as the model of it gives about 1, one with half its noise 0.25. 1 until a track has told.
+    """
+
+    def __init__(self) -> None:
+        self.value = 1.0
+        self._told = False
+
+    def learn(self, misfits: Sequence[float]) -> None:
+        """Take the misfits of the tracks of one frame that leave no doubt."""
+        if misfits:
+            told = float(np.median(misfits))
+            self.value += (0.1 if self._told else 1.0) * (told - self.value)
+            self._told = True
 
 
 Occluders: TypeAlias = Mapping[int, tuple[TrackedModel, Float64]]
@@ -115,6 +140,7 @@ class Prober:
         self._registration = Registration(probe)
         self._shown: dict[int, TrackedModel] = {}
         self._fixed: dict[int, Float64] = {}
+        self._noise = 1.0
 
     def close(self) -> None:
         """Release the scene's memory."""
@@ -131,8 +157,13 @@ class Prober:
         depth: Float32,
         intrinsics: CameraIntrinsics,
         occluders: Occluders,
+        noise: float = 1.0,
     ) -> RegistrationResult | None:
-        """Register each alternative and return the one that fits best, or None if none can be believed."""
+        """Register each alternative and return the one that fits best, or None if none can be believed.
+
+        `noise` is the misfit of right poses, see `NoiseLevel`.
+        """
+        self._noise = noise
         self._show(model, occluders)
         near = self._near(hypotheses, depth, intrinsics)
         found = self._settled(near, depth, intrinsics) if near else self._searched(hypotheses, depth, intrinsics)
@@ -140,7 +171,7 @@ class Prober:
             return found
         # What is in a hand has the hand's surface closely before it, to which wider gates lead away.
         held = [self._register(h.T_camera_object, depth, intrinsics, self._held) for h in hypotheses]
-        return min((r for r in held if r is not None and believable(r, self._fit)), key=cost, default=None)
+        return min((r for r in held if r is not None and believable(r, self._fit, noise)), key=cost, default=None)
 
     def _searched(
         self, hypotheses: Sequence[PoseHypothesis], depth: Float32, intrinsics: CameraIntrinsics
@@ -151,7 +182,7 @@ class Prober:
         if result is not None and self._fit.promising < result.support and not self._good(result):
             turned = [_turned(starts[0], axis, sign * self._fit.retry_angle) for axis in range(3) for sign in (1, -1)]
             result = min((r for r in (result, self._best_of(turned, depth, intrinsics)) if r), key=cost, default=None)
-        if result is None or not believable(result, self._fit):
+        if result is None or not believable(result, self._fit, self._noise):
             return None
         turned = min(angle_between(result.T_camera_object[:3, :3], h.T_camera_object[:3, :3]) for h in hypotheses)
         return result if turned <= self._fit.turn else None
@@ -181,10 +212,10 @@ class Prober:
         if found is None or not self._good(found):
             wider = self._best_of(poses, depth, intrinsics)
             found = min((r for r in (found, wider) if r is not None), key=cost, default=None)
-        return found if found is not None and believable(found, self._fit) else None
+        return found if found is not None and believable(found, self._fit, self._noise) else None
 
     def _good(self, result: RegistrationResult) -> bool:
-        return result.support >= self._fit.good_support and result.misfit <= self._fit.good_misfit
+        return result.support >= self._fit.good_support and result.misfit <= self._fit.good_misfit * self._noise
 
     def _best_of(
         self, starts: Sequence[Float64], depth: Float32, intrinsics: CameraIntrinsics

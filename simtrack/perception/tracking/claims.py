@@ -125,7 +125,7 @@ class ClaimQueue:
         self._prober.count_casts(step)
         (view, around), later = views[0], views[1:]
         model = self._models[claim.class_name]
-        fit = self._prober.best(claim.group, model, view.depth, view.intrinsics, around)
+        fit = self._prober.best(claim.group, model, view.depth, view.intrinsics, around, view.noise)
         if fit is None:
             return None
         candidate = Candidate.found(model, fit, view, self._config)

@@ -226,8 +226,8 @@ def take_marked(marks, height, width):
 
 @njit(cache=True, nogil=True)
 def point_correspondences(
-    pixels, directions, distances, normals, rows, readings, width, strides, gate, sigma, model_sigma, pixel_noise,
-    lateral, origin, points, start, counts,
+    pixels, directions, distances, normals, rows, readings, width, strides, gate, front, sigma, model_sigma,
+    pixel_noise, lateral, origin, points, start, counts,
 ):  # fmt: skip
     """Pair measured points with model points along the viewing rays; returns the number of pairs, earlier ones too.
 
@@ -243,6 +243,7 @@ def point_correspondences(
         width: of the image, pixels.
         strides: (K,) pixel grid that each instance is sampled on.
         gate: largest distance along the normal, metres; 3 sigma of the sensor are added.
+        front: share of this distance within which readings before the model count.
         sigma: standard deviation of the readings, metres; 0: that of a depth camera, see `axial_variance`.
         model_sigma: surface error of the models, metres.
         pixel_noise: focal length times baseline of a depth camera, px m.
@@ -277,6 +278,8 @@ def point_correspondences(
         variance = sigma * sigma if sigma > 0.0 else axial_variance(z, cosine, pixel_noise)
         slack = 3.0 * np.sqrt(variance)
         widest = gate + slack * cosine
+        if delta < 0.0:
+            widest *= front
         if abs(delta * along) > widest or abs(delta) > 3.0 * widest + slack:
             counts[k, OCCLUDED if delta < 0.0 else MISSING] += 1
             continue

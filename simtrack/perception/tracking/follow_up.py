@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtrack.contracts import NANOSECONDS
+from simtrack.contracts import NANOSECONDS, Float64
 from simtrack.geometry.transforms import inverse, rotate_covariance
 from simtrack.perception.tracking.birth import Occluders, Prober, believable
 from simtrack.perception.tracking.filter import Measurement, PoseFilter
@@ -21,34 +21,57 @@ class Candidate:
     fit: RegistrationResult
     """To the detection's own image."""
     filter: PoseFilter
+    T_base_object: Float64
+    """(4, 4), in the last image to which it could be registered."""
     seen: int
-    """Nanoseconds, of the last image to which it could be registered."""
+    """Nanoseconds, of that image."""
     reached: int
     """Nanoseconds, of the last image that was looked at."""
+    frames: int = 0
+    """Later images to which it could be registered."""
 
     @classmethod
     def found(cls, model: TrackedModel, fit: RegistrationResult, view: View, config: TrackerConfig) -> "Candidate":
         """Start at the image of the detection."""
-        covariance = rotate_covariance(view.T_map_camera[:3, :3], fit.covariance)
-        state = PoseFilter(view.stamp, view.T_map_camera @ fit.T_camera_object, covariance, config.filter)
-        return cls(model, fit, state, view.stamp, view.stamp)
+        T_base_object = view.T_base_camera @ fit.T_camera_object
+        return cls(model, fit, _filter(fit, view, config), T_base_object, view.stamp, view.stamp)
 
     def follow(self, prober: Prober, views: Iterable[tuple[View, Occluders]], config: TrackerConfig) -> None:
-        """Register it to later depth images, each with what is believed to stand around."""
+        """Register it to later depth images, each with what is believed to stand around.
+
+        Where it is not to be found where it was in the map, the robot may have learned meanwhile that it stands
+        elsewhere: it is looked for where it was before the robot.
+        """
         for view, around in views:
-            T = inverse(view.T_map_camera) @ self.filter.predict(view.stamp).T_map_object
-            followed = prober.follow(T, self.model, view.depth, view.intrinsics, around)
-            if followed is not None and believable(followed, config.fit):
-                self.filter.update(measurement(view, followed, self.seen, config))
-                self.seen = view.stamp
-            else:
-                self.filter.skip(view.stamp)
+
+            def registered(T: Float64, view: View = view, around: Occluders = around) -> RegistrationResult | None:
+                result = prober.follow(T, self.model, view.depth, view.intrinsics, around)
+                return result if result is not None and believable(result, config.fit, view.noise) else None
+
             self.reached = view.stamp
+            result = registered(inverse(view.T_map_camera) @ self.filter.predict(view.stamp).T_map_object)
+            if result is not None:
+                self.filter.update(measurement(view, result, self.seen, config))
+            else:
+                result = registered(inverse(view.T_base_camera) @ self.T_base_object)
+                if result is None:
+                    self.filter.skip(view.stamp)
+                    continue
+                self.filter = _filter(result, view, config)
+            self.T_base_object = view.T_base_camera @ result.T_camera_object
+            self.seen = view.stamp
+            self.frames += 1
 
     @property
     def lost(self) -> bool:
         """Whether it has not been seen in the last images."""
         return self.reached - self.seen > 0.15 * NANOSECONDS
+
+
+def _filter(result: RegistrationResult, view: View, config: TrackerConfig) -> PoseFilter:
+    """That of an object at rest, known from one image."""
+    covariance = rotate_covariance(view.T_map_camera[:3, :3], result.covariance)
+    return PoseFilter(view.stamp, view.T_map_camera @ result.T_camera_object, covariance, config.filter)
 
 
 def measurement(view: View, result: RegistrationResult, last_seen: int, config: TrackerConfig) -> Measurement:

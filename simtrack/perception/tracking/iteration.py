@@ -46,7 +46,7 @@ def iterate(
     measured, model, normal, weight, owner, edge_point, edge_direction, edge_offset, edge_weight, edge_owner,
     instances, active, strides, fine_strides, radii, camera, poses,
     counts, seen, used, covariance, constrained, stats, moved, deviations,
-    fine, gate, model_sigma, focal_baseline, edge_reach, edge_step, correlation_area, edge_correlation,
+    fine, gate, front, model_sigma, focal_baseline, edge_reach, edge_step, correlation_area, edge_correlation,
     edges, kernel, edge_kernel, edge_sigma, unconstrained_sigma, max_shift, max_turn, last_step,
     iterations, closed_form,
 ):  # fmt: skip
@@ -88,7 +88,8 @@ def iterate(
         moved: (K,), out, see `advance`, as for `deviations` (K,).
         deviations: see there.
         fine: whether this is the finest cast.
-        gate: see `point_correspondences`, as for `model_sigma` and `focal_baseline`.
+        gate: see `point_correspondences`, as for `front`, `model_sigma` and `focal_baseline`.
+        front: see there.
         model_sigma: see there.
         focal_baseline: see there.
         edge_reach: pixels, see `edge_correspondences`, or `NO_SILHOUETTES`.
@@ -118,8 +119,8 @@ def iterate(
     points = Points(measured, model, normal, weight, owner)
     silhouette = Edges(edge_point, edge_direction, edge_offset, edge_weight, edge_owner)
     pairs = point_correspondences(
-        pixels, directions, distances, normals, rows, depth.reshape(-1), depth.shape[1], strides, gate, 0.0,
-        model_sigma, focal_baseline, 0.4 / camera[0], np.zeros(3), points, 0, counts,
+        pixels, directions, distances, normals, rows, depth.reshape(-1), depth.shape[1], strides, gate, front,
+        0.0, model_sigma, focal_baseline, 0.4 / camera[0], np.zeros(3), points, 0, counts,
     )  # fmt: skip
     edge_pairs = 0
     if edge_reach != NO_SILHOUETTES:

@@ -254,10 +254,11 @@ class Registration:
             bundle.pixels, bundle.directions, hits.distances, hits.normals, hits.instances, batch.depth, *self._images,
             self._marks, *self._points, *self._edges, batch.ids, batch.active, strides, batch.fine_strides,
             batch.radii, batch.camera, batch.poses, batch.counts, batch.edges, batch.used, batch.covariance,
-            batch.constrained, batch.stats, batch.moved, batch.deviations, step.fine, step.gate, config.model_sigma,
-            config.focal_baseline, reach, config.edge_step, config.correlation_area, config.edge_correlation,
-            _EDGES[step.silhouettes], step.kernel, config.edge_kernel, config.edge_sigma, config.unconstrained_sigma,
-            config.max_shift, config.max_turn, config.last_step, iterations, config.solver == "umeyama",
+            batch.constrained, batch.stats, batch.moved, batch.deviations, step.fine, step.gate, config.front,
+            config.model_sigma, config.focal_baseline, reach, config.edge_step, config.correlation_area,
+            config.edge_correlation, _EDGES[step.silhouettes], step.kernel, config.edge_kernel, config.edge_sigma,
+            config.unconstrained_sigma, config.max_shift, config.max_turn, config.last_step, iterations,
+            config.solver == "umeyama",
         )  # fmt: skip
         if iterations:
             moved = np.flatnonzero(batch.active)

@@ -55,6 +55,9 @@ class RegistrationConfig:
     """What a track is tried with first: most predictions are so good that wide gates would only lead away from them."""
     finish: Step | None = field(default=Step(gate=0.006, kernel=3.0, edge_reach=5, fine=True, silhouettes="always"))
     """How a track ends, near or not: a single cast at full resolution, from a pose that leaves little to be moved."""
+    front: float = 0.5
+    """Readings before a model count within this share of the gates only: what holds a thing, or leans on it, stands
+    closely before it, and nothing stands behind its surface. With 1, things in a hand slide onto the fingers."""
     patience: float | None = None
     """Seconds of the wall clock after which the finish is left out, where a late answer is worse than a less exact one;
     None: it never is, and results do not depend on the machine."""
@@ -109,6 +112,8 @@ class RegistrationConfig:
             raise InvalidValueError("RegistrationConfig.solver", self.solver, "gauss-newton, umeyama")
         if any(step.fine for step in (*self.schedule, *self.track_schedule, self.near)):
             raise InvalidValueError("RegistrationConfig.schedule", "a fine step", "fine steps only as `finish`")
+        if not 0.0 < self.front <= 1.0:
+            raise InvalidValueError("RegistrationConfig.front", self.front, "more than 0, at most 1")
         if self.patience is not None and not self.patience >= 0.0:
             raise InvalidValueError("RegistrationConfig.patience", self.patience, ">= 0 s, or None")
         if self.finish is not None and self.finish.repeats != 1:  # a fine cast takes the rays that coarse ones marked

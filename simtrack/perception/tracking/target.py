@@ -78,6 +78,11 @@ class TrackerConfig:
     """An object of the same class that appears within reach of one that was being moved is that one, m/s."""
     same_object_memory: float = 4.0
     """... if that one was last seen at most this long ago, seconds."""
+    identity_time: float = 0.5
+    """A track that was believed for less than this in all, seconds, may never have been of anything: once it is lost,
+    nothing that turns up is taken for it."""
+    reunite_time: float = 1.5
+    """What turned up at most this long ago, seconds, is the object of its class that is not believed any more."""
 
 
 @dataclass(slots=True)
@@ -89,6 +94,9 @@ class View:
     intrinsics: CameraIntrinsics
     T_map_camera: Float64
     covariance: Float64
+    T_base_camera: Float64
+    noise: float
+    """Misfit of right poses, see `simtrack.perception.tracking.birth.NoiseLevel`."""
 
 
 @dataclass(slots=True)
@@ -108,6 +116,10 @@ class Target:
     doubts: int = 0
     """Registrations in a row that were not believed."""
     moved_when_seen: bool = False
+    newcomer: bool = True
+    """It is not one that was known before, and the belief in it has not been ended yet."""
+    believed: int = 0
+    """Nanoseconds for which it was believed and seen."""
     known: bool = False
     """It was believed once: its identity is kept for when it turns up again."""
     score: float = 0.5
@@ -119,6 +131,16 @@ class Target:
     def alive(self) -> bool:
         """Whether it takes part in registration."""
         return self.status is not TrackStatus.LOST
+
+    def clear(self, config: TrackerConfig) -> bool:
+        """Whether it is believed, and its last registration leaves no doubt."""
+        result, seen = self.result, self.status is TrackStatus.CONFIRMED
+        return seen and result is not None and result.support >= config.doubtful_support and not self.vague(config)
+
+    @property
+    def gone(self) -> bool:
+        """Whether it is not believed any more where it was, and no detection has said otherwise since."""
+        return not self.alive or (self.status is TrackStatus.TENTATIVE and self.known and self.detections == 0)
 
     def vague(self, config: TrackerConfig) -> bool:
         """Whether the depth image determines its orientation too poorly to outweigh detections."""

@@ -32,7 +32,7 @@ from simtrack.perception.tracking.association import (
     nearest_equivalent,
     rotation_apart,
 )
-from simtrack.perception.tracking.birth import Occluders, Prober, believable, cost
+from simtrack.perception.tracking.birth import NoiseLevel, Occluders, Prober, believable, cost, fits_noise
 from simtrack.perception.tracking.claims import Claim, ClaimQueue, Views
 from simtrack.perception.tracking.correspondences import usable_depth
 from simtrack.perception.tracking.filter import Measurement, PoseFilter
@@ -73,6 +73,7 @@ class ObjectTracker:
         self._targets: list[Target] = []
         self._next_id = 1
         self._views: deque[View] = deque()
+        self._noise = NoiseLevel()
         self.trace: RegistrationTrace | None = None
         """The last frame's registration, for those who look for the cause of an error."""
 
@@ -109,7 +110,10 @@ class ObjectTracker:
                 raise UnknownNameError("object class", h.class_name, self._models)
         if self._views and frame.stamp <= self._views[-1].stamp:
             return TrackerResult(frame.stamp, self._tracks(self._views[-1]), Status.STALE)
-        view = View(frame.stamp, usable_depth(frame.depth), frame.intrinsics, T_map_camera, covariance)
+        depth = usable_depth(frame.depth)
+        view = View(
+            frame.stamp, depth, frame.intrinsics, T_map_camera, covariance, frame.T_base_camera, self._noise.value
+        )
         self._views.append(view)
         while view.stamp - self._views[0].stamp > self.config.buffer * NANOSECONDS:
             self._views.popleft()
@@ -118,7 +122,7 @@ class ObjectTracker:
         self._take_detections(hypotheses)
         self._settle_claims(view.stamp)
         self._prune(view.stamp)
-        self._reunite()
+        self._reunite(view.stamp)
         return TrackerResult(frame.stamp, self._tracks(view), status)
 
     def _register(self, view: View, status: Status, hypotheses: Sequence[PoseHypothesis]) -> None:
@@ -135,6 +139,7 @@ class ObjectTracker:
         )  # fmt: skip
         for target in living:
             self._judge(target, view, poses[target.id], results.get(target.id))
+        self._noise.learn([t.result.misfit for t in living if t.result is not None and t.clear(self.config)])
 
     def _judge(self, target: Target, view: View, T_predicted: Float64, result: RegistrationResult | None) -> None:
         """What one registration says of a target: seen, occluded, out of view or missing."""
@@ -186,6 +191,8 @@ class ObjectTracker:
         target.doubts = 0
         target.filter.update(taken)
         target.frames += 1
+        if target.status is TrackStatus.CONFIRMED:
+            target.believed += view.stamp - target.last_seen
         target.last_seen = view.stamp
         target.missing_since = None
         target.residual = result.residual
@@ -196,7 +203,7 @@ class ObjectTracker:
 
     def _proven(self, target: Target, result: RegistrationResult) -> bool:
         """Whether enough has been seen of a new object to believe in it."""
-        if result.misfit > self.config.fit.misfit or target.frames < self.config.confirm_frames:
+        if not fits_noise(result, self.config.fit, self._noise.value) or target.frames < self.config.confirm_frames:
             return False
         # A fit that leaves no doubt needs no second detection.
         clear = not target.doubtful(self.config) and not target.vague(self.config)
@@ -219,12 +226,12 @@ class ObjectTracker:
     @staticmethod
     def _demote(target: Target, stamp: int) -> None:
         """End the belief in a track until detections bear it out."""
-        target.status, target.born = TrackStatus.TENTATIVE, stamp
+        target.status, target.born, target.newcomer = TrackStatus.TENTATIVE, stamp, False
         target.detections, target.frames, target.disagreements, target.doubts = 0, 0, 0, 0
 
     def _lose(self, target: Target) -> None:
         """Take a target out of the scene; its identity is kept for when the object turns up again."""
-        if not target.known:
+        if target.believed < self.config.identity_time * NANOSECONDS:
             self._targets.remove(target)
         target.status = TrackStatus.LOST
         target.visible_fraction = 0.0
@@ -237,15 +244,20 @@ class ObjectTracker:
             if target.status is TrackStatus.TENTATIVE and stale:
                 self._lose(target)
 
-    def _reunite(self) -> None:
+    def _reunite(self, now: int) -> None:
         """What turned up a moment before a known object of its class was seen to be gone is that object."""
-        for new in list(self._targets):
-            lost = [t for t in self._targets if not t.alive and t.model is new.model]
-            if lost and new.status is TrackStatus.TENTATIVE and not new.known:
-                before = max(lost, key=lambda t: t.last_seen)
+        for new in [t for t in self._targets if t.newcomer and t.alive]:
+            if now - new.born > self.config.reunite_time * NANOSECONDS:
+                continue
+            gone = [t for t in self._targets if t.model is new.model and t.gone and t is not new]
+            if gone:
+                before = max(gone, key=lambda t: t.last_seen)
                 self._targets.remove(before)
+                if before.alive:
+                    self._registration.remove(before.id)
                 self._registration.remove(new.id)
-                new.id, new.known = before.id, True
+                new.id, new.known, new.newcomer = before.id, True, False
+                new.believed += before.believed
                 self._registration.add(new.id, self._tracked[new.model.name])
 
     # -------------------------------------------------------------------------------------------------- late detections
@@ -348,7 +360,10 @@ class ObjectTracker:
         """Whether two poses of a target's model are believable each, and explain different measurements."""
         model = self._tracked[target.model.name]
         extents, poses = target.model.extents, (a.T_camera_object, b.T_camera_object)
-        if not believable(a, self.config.fit) or box_overlap(poses[0], extents, poses[1], extents) >= SAME_PLACE:
+        if (
+            not believable(a, self.config.fit, view.noise)
+            or box_overlap(poses[0], extents, poses[1], extents) >= SAME_PLACE
+        ):
             return False
         shared = self._prober.shared(poses[1], model, poses[0], model, view.depth, view.intrinsics)
         return shared < self.config.shared_surface
@@ -382,6 +397,9 @@ class ObjectTracker:
         target = self._known_before(model, followed) or self._newcomer(model, followed, view)
         target.filter, target.last_seen = followed, followed.state.stamp
         target.residual, target.missing_since = result.residual, None
+        others = [t for t in self._targets if t is not target and t.model is model and t.alive and t.known]
+        # One that is not seen may be this one: that it is gone has to be seen first.
+        target.frames = candidate.frames if all(t.last_seen >= followed.state.stamp for t in others) else 0
         self._registration.add(target.id, self._tracked[model.name])
 
     def _around(self, view: View, but: Target | None = None) -> Occluders:
@@ -432,7 +450,8 @@ class ObjectTracker:
     @staticmethod
     def _revive(target: Target, stamp: int) -> Target:
         """A known object has turned up again: it keeps its identity and is believed after another detection."""
-        target.status, target.born, target.detections, target.frames = TrackStatus.TENTATIVE, stamp, 1, 0
+        target.status, target.born, target.newcomer = TrackStatus.TENTATIVE, stamp, False
+        target.detections, target.frames = 1, 0
         return target
 
     def _catch_up(self, candidate: Candidate, but: Target | None = None) -> None:

@@ -33,9 +33,9 @@ class BenchWorld:
     def add(self, model: ObjectModel, T_map_object: Float64) -> int:
         return self.scene.add(TriangleMesh(model.mesh.vertices, model.mesh.faces), T_map_object)
 
-    def depth(self) -> Float32:
+    def depth(self, T_map_camera: Float64 = T_MAP_CAMERA) -> Float32:
         bundle = RayBundle.from_camera(INTRINSICS)
-        d = self.scene.cast(bundle, T_MAP_CAMERA).distances.reshape(bundle.shape)
+        d = self.scene.cast(bundle, T_map_camera).distances.reshape(bundle.shape)
         return np.where(np.isfinite(d), d, 0.0).astype(np.float32)
 
     def frame(self, stamp: int, depth: Float32 | None = None) -> RgbdFrame:
