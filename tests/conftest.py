@@ -7,11 +7,15 @@ from itertools import chain, zip_longest
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from tests.kernel_locks import compile_kernels_once
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 WHOLE_RUNS = ("end_to_end", "cli", "benchmarks")
+
+settings.register_profile("simtrack", deadline=None)  # machines are busy, kernels compile
+settings.load_profile("simtrack")
 
 # Folders that the user has set up must neither help nor disturb; set before simtrack is imported.
 for _variable in ("SIMTRACK_SCENES", "SIMTRACK_GENERATORS", "SIMTRACK_OBJECTS"):

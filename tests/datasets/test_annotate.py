@@ -53,7 +53,7 @@ poses = st.builds(
 )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(poses, min_size=3, max_size=3))
 def test_labels_obey_their_laws_wherever_things_are(at: list[Float64]) -> None:
     things = (placed(1, BRACKET, at[0]), placed(2, CAN, at[1], 2), placed(3, BOX, at[2], None, 1.5))

@@ -36,7 +36,7 @@ def test_a_box_has_three_corners_a_vertex_and_a_round_thing_one_normal_a_vertex_
     assert np.einsum("ij,ij->i", normals[wall], radial).min() > 0.99
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 3.0))
 def test_any_triangles_can_be_drawn(seed: int, crease: float) -> None:
     rng = np.random.default_rng(seed)

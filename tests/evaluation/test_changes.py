@@ -18,7 +18,7 @@ places = st.tuples(*[st.floats(-2.0, 2.0)] * 3)
 things = st.lists(st.builds(Thing, st.sampled_from(["relay", "meter"]), places), max_size=6)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(things, things)
 def test_changes_lead_from_one_state_to_the_other(before, after) -> None:
     changes = changes_between(before, after)
@@ -29,7 +29,7 @@ def test_changes_lead_from_one_state_to_the_other(before, after) -> None:
         assert not {"removed", "added"} <= kinds
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(things)
 def test_equal_states_have_no_changes_whatever_their_order(state) -> None:
     assert changes_between(state, state[::-1]) == []

@@ -41,7 +41,7 @@ def test_the_distances_are_symmetric(a: SupportTree, b: SupportTree) -> None:
     assert there.missing == back.extra
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(trees(), trees())
 def test_no_matching_beats_the_optimal_one(a: SupportTree, b: SupportTree) -> None:
     if max(len(a.classes), len(b.classes)) <= 4:

@@ -72,7 +72,7 @@ def test_equals_bop_toolkit() -> None:
             assert value == pytest.approx(case[name], rel=1e-6), (name, case["obj_id"])
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(vectors, vectors, vectors)
 def test_symmetric_equivalents_have_no_error(phi: Float64, t: Float64, turn: Float64) -> None:
     T = transform(exp_so3(3.0 * phi), tuple(t))
@@ -83,7 +83,7 @@ def test_symmetric_equivalents_have_no_error(phi: Float64, t: Float64, turn: Flo
     assert pose_errors.rotation_error(T @ transform(exp_so3(turn)), T, sphere) == pytest.approx(0.0, abs=1e-7)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(vectors, vectors)
 def test_continuous_axis_is_not_worse_than_a_fine_search(phi: Float64, psi: Float64) -> None:
     T_true, T_est = transform(exp_so3(2.0 * phi)), transform(exp_so3(2.0 * psi))

@@ -12,7 +12,7 @@ from simtrack.perception.localization.measurement import Measurement
 from simtrack.raycast import RayScene, TriangleMesh
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     values=st.lists(st.floats(-2.0 * LIMIT, 2.0 * LIMIT, width=32), min_size=1, max_size=60),
     share=st.floats(0.01, 1.0),

@@ -41,13 +41,13 @@ def inflated(box: OrientedBox) -> OrientedBox:
     return OrientedBox(box.T_map_box, box.extents + 1e-9)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(boxes, boxes)
 def test_distance_solves_the_quadratic_programme(a: OrientedBox, b: OrientedBox) -> None:
     assert proximity(a, b).distance == pytest.approx(least_squares_distance(a, b), abs=1e-6)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(boxes, boxes)
 def test_closest_points_lie_in_the_boxes_at_that_distance(a: OrientedBox, b: OrientedBox) -> None:
     found = proximity(a, b)
@@ -56,7 +56,7 @@ def test_closest_points_lie_in_the_boxes_at_that_distance(a: OrientedBox, b: Ori
     assert np.linalg.norm(found.point_a - found.point_b) == pytest.approx(found.distance, abs=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(boxes, boxes, seeds)
 def test_no_pair_of_points_is_closer_or_farther(a: OrientedBox, b: OrientedBox, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def test_no_pair_of_points_is_closer_or_farther(a: OrientedBox, b: OrientedBox, 
     assert np.linalg.norm(found.farthest_a - found.farthest_b) == pytest.approx(found.maximum)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(boxes, boxes, poses)
 def test_distance_is_symmetric_and_keeps_under_rigid_motion(a: OrientedBox, b: OrientedBox, T: Float64) -> None:
     signed = proximity(a, b).signed
@@ -79,14 +79,14 @@ def test_distance_is_symmetric_and_keeps_under_rigid_motion(a: OrientedBox, b: O
     assert proximity(moved(a, T), moved(b, T)).signed == pytest.approx(signed, abs=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(boxes, boxes, boxes)
 def test_detour_over_a_third_box_is_not_shorter(a: OrientedBox, b: OrientedBox, c: OrientedBox) -> None:
     way = proximity(a, b).distance + 2.0 * np.linalg.norm(0.5 * b.extents) + proximity(b, c).distance
     assert proximity(a, c).distance <= way + 1e-9
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(boxes, boxes, seeds)
 def test_penetration_is_the_shortest_way_apart(a: OrientedBox, b: OrientedBox, seed: int) -> None:
     depth = -proximity(a, b).signed

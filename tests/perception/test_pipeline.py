@@ -114,7 +114,7 @@ def _assert_sane(belief: Belief) -> None:
     assert all(isinstance(s, Status) for s in belief.status.values())
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(events, steps, st.booleans()), min_size=1, max_size=12), st.integers(0, 2**31))
 def test_any_feed_is_survived(stack: PerceptionStack, feed: list, seed: int) -> None:
     rng = np.random.default_rng(seed)

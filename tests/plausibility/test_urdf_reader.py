@@ -148,7 +148,7 @@ def test_groups_of_an_obj_are_convex_parts_of_their_own(tmp_path: Path) -> None:
     assert [np.ptp(shape.corners()[:, 0]) for shape in tree.bodies[0].collision] == pytest.approx([0.1, 0.1])
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damaged_files_never_raise(tmp_path: Path, data: st.DataObject) -> None:
     joint = f'<joint name="j" type="revolute">{ENDS}<limit lower="0" upper="1"/></joint>'

@@ -54,7 +54,7 @@ def test_strided_windows_take_multiples_of_the_stride() -> None:
 
 
 @given(st.lists(st.integers(0, 64 * 48 - 1), max_size=200))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_any_pixels_keep_their_order(pixels: list[int]) -> None:
     bundle = RayBundle.from_pixels(CAMERA, pixels)
     assert bundle.pixels is not None
@@ -135,7 +135,7 @@ def test_cones_hold_their_rays() -> None:
 
 
 @given(st.integers(0, 2**31), st.integers(1, 3))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_windows_hold_the_union_of_their_grids(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     corners = rng.integers(-20, 80, (count, 2, 2))

@@ -114,7 +114,7 @@ def test_open_meshes_have_no_inside_and_every_instance_its_own() -> None:
 
 
 @given(st.integers(0, 2**31), st.floats(0.05, 2.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_signed_distance_of_a_ball_is_that_of_its_radius(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
     T = transform(exp_so3(rng.normal(size=3)) * scale, rng.normal(size=3))

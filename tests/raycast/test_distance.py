@@ -42,7 +42,7 @@ def exhaustive(first: np.ndarray, second: np.ndarray) -> float:
 
 
 @given(SEEDS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_triangles_are_as_far_apart_as_no_pair_of_their_points(seed: int) -> None:
     """No point of one is nearer to one of the other, and the points found lie on the triangles."""
     rng = np.random.default_rng(seed)
@@ -79,7 +79,7 @@ def test_the_trees_find_what_an_exhaustive_search_finds(seed: int) -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_balls_in_closed_form(seed: int) -> None:
     rng = np.random.default_rng(seed)
     radii, centres = rng.uniform(0.2, 1.0, 2), rng.normal(size=(2, 3))
@@ -128,7 +128,7 @@ def test_what_is_inside_is_colliding_and_what_is_open_has_no_inside() -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_laws(seed: int) -> None:
     """Symmetry, invariance to a common motion and to the limit, and points that lie on the surfaces."""
     rng = np.random.default_rng(seed)

@@ -133,7 +133,7 @@ def test_a_killed_writer_leaves_all_whole_chunks(tmp_path: Path) -> None:
     assert all(same(frame, rgbd_frame(rng, index, size=(480, 640))) for index, frame in enumerate(read))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(index=st.integers(0, 3000) | st.integers(0, 2**32), flip=st.integers(1, 255))
 def test_a_flipped_byte_is_found_or_harmless(
     whole: Log, tmp_path_factory: pytest.TempPathFactory, index: int, flip: int
@@ -151,7 +151,7 @@ def test_a_flipped_byte_is_found_or_harmless(
             assert all(same(a, b) for a, b in zip(read, whole.entries, strict=False))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(content=st.binary(max_size=300))
 def test_noise_is_refused(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
     path = write(tmp_path_factory.getbasetemp() / "noise.mcap", MCAP0_MAGIC + content)

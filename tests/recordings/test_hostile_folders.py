@@ -137,7 +137,7 @@ def test_sizes_are_read_from_headers(tmp_path: Path) -> None:
     assert image_size(b"GIF89a" + bytes(50)) is None
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(data=st.binary(max_size=60), start=st.sampled_from([b"\xff\xd8\xff", b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b""]))
 def test_no_header_breaks_the_reader_of_headers(data: bytes, start: bytes) -> None:
     size = image_size(start + data)
@@ -282,7 +282,7 @@ def test_ply_bodies_must_hold_what_is_claimed(tmp_path: Path) -> None:
         refused(tmp_path, "element vertex")
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(at=st.integers(0, 400), flip=st.integers(1, 255))
 def test_flipped_bytes_of_a_ply_are_refused_or_harmless(
     tmp_path_factory: pytest.TempPathFactory, at: int, flip: int

@@ -33,7 +33,7 @@ def test_every_entry_comes_back_to_the_bit_and_in_the_order_of_arrival(record: R
     assert all(same(a, b) for a, b in zip(read, entries, strict=True))
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     seed=st.integers(0, 2**32 - 1),
     stamps=st.lists(st.integers(-(10**18), 10**18), min_size=1, max_size=6),

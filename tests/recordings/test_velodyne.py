@@ -160,7 +160,7 @@ def test_a_sensor_that_does_not_turn_is_named(packets: list[bytes], tmp_path: Pa
         scans_of(path)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(flips=st.lists(st.tuples(st.integers(0, 2**20), st.integers(1, 255)), min_size=1, max_size=8))
 def test_flipped_bytes_are_refused_or_harmless(
     packets: list[bytes], tmp_path_factory: pytest.TempPathFactory, flips: list[tuple[int, int]]
@@ -179,7 +179,7 @@ def test_flipped_bytes_are_refused_or_harmless(
             assert np.isfinite(scan.times).all() and len(scan.times) == len(scan.ranges)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(content=st.binary(max_size=400))
 def test_noise_behind_a_header_is_refused_or_harmless(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
     path = capture(tmp_path_factory.getbasetemp() / "noise.pcap", pcap([])[:24] + content)

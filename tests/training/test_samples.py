@@ -51,7 +51,7 @@ def pose(seed: int) -> Float64:
     return transform(exp_so3(rng.uniform(-3, 3, 3)), tuple(rng.uniform((-0.15, -0.15, 0.7), (0.15, 0.15, 1.3))))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 10_000), keypoint=st.integers(0, 8))
 def test_a_keypoint_is_told_where_its_pixel_is_shown(seed: int, keypoint: int) -> None:
     import cv2
@@ -118,7 +118,7 @@ def test_what_is_not_there_is_told_so() -> None:
     assert not shown.points.any()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(
         st.tuples(st.integers(0, 2), st.floats(0.0, 220.0), st.floats(0.0, 160.0), st.floats(14.0, 120.0),

@@ -38,7 +38,7 @@ class FitConfig:
     """Fewest silhouette pixels that must have a depth step behind them: a flat side fits any wall."""
     constrained: int = 4
     """Fewest directions that the data must constrain."""
-    rotation_sigma: float = np.deg2rad(6.0)
+    rotation_sigma: float = np.deg2rad(4.5)
     """Largest standard deviation of a constrained orientation, radians: a small thing far away fits in many ways."""
     good_support: float = 0.95
     """A fit with less support than this is tried again from turned starts ..."""

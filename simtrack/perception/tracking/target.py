@@ -144,10 +144,13 @@ class Target:
 
     def vague(self, config: TrackerConfig) -> bool:
         """Whether the depth image determines its orientation too poorly to outweigh detections."""
+        return self.vaguer(config.vague_rotation)
+
+    def vaguer(self, angle: float) -> bool:
+        """Whether its orientation has a larger standard deviation than this about some axis, radians."""
         if self.result is None:
             return True
-        variances = np.linalg.eigvalsh(self.result.covariance[3:, 3:])
-        return bool(variances[-1] > config.vague_rotation**2)
+        return bool(np.linalg.eigvalsh(self.result.covariance[3:, 3:])[-1] > angle**2)
 
     def doubtful(self, config: TrackerConfig) -> bool:
         """Whether its last registration may have slid into a wrong minimum."""

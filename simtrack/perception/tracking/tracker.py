@@ -213,13 +213,16 @@ class ObjectTracker:
         """Whether a registration tells of a motion that is too fast for hands, or that it cannot tell of.
 
         A hand that takes a small thing far away is one blob with it: its registration follows the hand. So an object
-        that stood still is only believed to move if the depth image determines its orientation.
+        that stood still is only believed to move if the depth image determines its orientation, and what moves only
+        while it does at all.
         """
         span = 0.1
         T_before = target.filter.pose_at(m.stamp - round(span * NANOSECONDS))
         moved = float(np.linalg.norm(m.T_map_object[:3, 3] - T_before[:3, 3]))
         turned = rotation_apart(m.T_map_object, T_before, target.model)
         if moved > self.config.fastest * span or turned > self.config.fastest_turn * span:
+            return True
+        if target.filter.state.moving and target.vaguer(self.config.fit.rotation_sigma):
             return True
         return target.vague(self.config) and target.filter.starts_to_move(m)
 
@@ -246,7 +249,7 @@ class ObjectTracker:
 
     def _reunite(self, now: int) -> None:
         """What turned up a moment before a known object of its class was seen to be gone is that object."""
-        for new in [t for t in self._targets if t.newcomer and t.alive]:
+        for new in [t for t in self._targets if t.newcomer and t.status is TrackStatus.CONFIRMED]:
             if now - new.born > self.config.reunite_time * NANOSECONDS:
                 continue
             gone = [t for t in self._targets if t.model is new.model and t.gone and t is not new]

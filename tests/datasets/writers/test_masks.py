@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -25,7 +25,6 @@ def masks(draw: st.DrawFn) -> tuple[Mask, np.ndarray]:
     return Mask(pixels, (u, v), (height, width)), whole
 
 
-@settings(deadline=None)
 @given(masks())
 def test_run_lengths_are_those_of_coco(given: tuple[Mask, np.ndarray]) -> None:
     mask, whole = given
@@ -45,7 +44,6 @@ def test_run_lengths_of_large_images_need_several_characters() -> None:
     assert ours["counts"] == pycocotools.encode(np.asfortranarray(whole.astype(np.uint8)))["counts"].decode()
 
 
-@settings(deadline=None)
 @given(masks())
 def test_a_mask_comes_back_from_its_png(given: tuple[Mask, np.ndarray]) -> None:
     mask, whole = given
@@ -60,7 +58,6 @@ def filled(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return image > 0
 
 
-@settings(deadline=None)
 @given(masks())
 def test_polygons_cover_the_mask_and_little_else(given: tuple[Mask, np.ndarray]) -> None:
     mask, whole = given

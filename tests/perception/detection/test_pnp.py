@@ -24,7 +24,7 @@ def _detection(T: np.ndarray, noise: np.ndarray | float = 0.0, name: str = "powe
 unit = st.floats(-1.0, 1.0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.tuples(unit, unit, unit), st.tuples(unit, unit, st.floats(0.6, 3.0)))
 def test_exact_keypoints_give_the_exact_pose(phi: tuple, position: tuple) -> None:
     x, y, z = position
@@ -53,7 +53,7 @@ def test_the_information_is_that_of_finite_differences() -> None:
     np.testing.assert_allclose(g, J.T @ _reprojection(T, pixels), rtol=1e-3, atol=1e-4 * np.abs(g).max())
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 1000))
 def test_refinement_ends_where_nothing_near_is_better(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -21,7 +21,7 @@ SIZE = 64
 
 
 @given(u=st.floats(60, 180), v=st.floats(60, 180), side=st.floats(20, 110))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_a_window_shows_the_pixels_that_it_says(u: float, v: float, side: float) -> None:
     ramp = np.broadcast_to(np.arange(240, dtype=np.uint8)[None, :, None], (240, 240, 3)).copy()
     pixels = Window(u, v, side).pixels_of(SIZE)
@@ -35,7 +35,7 @@ def test_a_window_shows_the_pixels_that_it_says(u: float, v: float, side: float)
 
 
 @given(scale=st.floats(0.5, 2.0), seed=st.integers(0, 99))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_a_thing_looks_the_same_from_near_and_far(scale: float, seed: int) -> None:
     """Twice as far away and twice as large, everything is seen alike."""
     rng = np.random.default_rng(seed)
@@ -69,7 +69,7 @@ def test_small_images_keep_readings_and_gaps() -> None:
 
 
 @given(st.floats(-BEFORE + 0.05, 1.0 + BEFORE - 0.05))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_coordinate_is_read_back_from_its_bins(place: float) -> None:
     assert np.isclose(place_of(position_of(np.float64(place))), place)
     bins = np.arange(BINS)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from simtrack.geometry.transforms import apply, exp_so3, log_so3, perturb, transform, transform_planar
@@ -33,7 +33,6 @@ def rows(count: int, stride: int) -> np.ndarray:
     return np.flatnonzero((np.arange(count) // BLOCK) % stride == 0)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 300), st.integers(1, 9))
 def test_thinning_takes_whole_blocks(count: int, stride: int) -> None:
     assert thinned_count(count, stride) == len(rows(count, stride))
@@ -86,7 +85,6 @@ def test_correspondences_are_whitened_by_the_sensor_and_by_what_a_patch_shares(
     assert own.max() < 1.2 * (0.008**2 + (0.001 * view.ranges.max()) ** 2)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.005, 0.3))
 def test_scale_of_the_kernel_is_three_medians(seed: int, spread: float) -> None:
     rng = np.random.default_rng(seed)
@@ -99,7 +97,6 @@ def test_scale_of_the_kernel_is_three_medians(seed: int, spread: float) -> None:
     assert found == pytest.approx(min(max(3.0 * median, 0.02), 1.0), abs=1.0 / 500 + 0.01 * median)
 
 
-@settings(deadline=None)
 @given(st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6))
 def test_compiled_rotations_are_those_of_the_geometry(numbers: list[float]) -> None:
     phi, psi = np.array(numbers[:3]), np.array(numbers[3:])

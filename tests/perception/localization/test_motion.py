@@ -75,7 +75,7 @@ def test_uncertainty_grows_with_motion_and_with_silence() -> None:
     assert (np.diag(silent) > 4 * np.diag(longer)).all()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**31))
 def test_propagated_covariance_is_that_of_sampled_poses(seed: int) -> None:
     """To first order: push small perturbations through the motion itself."""

@@ -41,7 +41,7 @@ def random_problem(seed: int, *, tied: bool = True, points: bool = True) -> Alig
 
 
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.booleans())
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_jacobian_equals_finite_differences(seed: int, tied: bool, points: bool) -> None:
     problem = random_problem(seed, tied=tied, points=points)
     unknowns = np.random.default_rng(seed + 1).normal(0.0, 0.3, 4)
@@ -51,7 +51,7 @@ def test_jacobian_equals_finite_differences(seed: int, tied: bool, points: bool)
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_area_outside_is_that_of_polygons(seed: int) -> None:
     rng = np.random.default_rng(seed)
     half, centre, yaw = rng.uniform(0.1, 1.0, 2), rng.uniform(-0.7, 0.7, 2), float(rng.uniform(-4.0, 4.0))

@@ -50,7 +50,7 @@ def test_orientations_are_the_turns_of_a_cube() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(0, 4))
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_assignment_is_optimal(seed: int, rows: int, columns: int) -> None:
     cost = np.random.default_rng(seed).uniform(0.0, 2.0, (rows, columns))
     pairs, total = assign(cost, unmatched=1.0)

@@ -22,7 +22,7 @@ def test_boxes_rest_on_each_other_where_their_faces_meet() -> None:
     assert rise(upper + [2.0, 0.0, 0.0], lower) is None
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_after_its_rise_a_piece_touches_and_does_not_overlap(seed: int) -> None:
     rng = np.random.default_rng(seed)

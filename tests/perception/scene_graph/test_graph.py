@@ -140,7 +140,7 @@ def random_motion(seed: int) -> Float64:
     return transform(exp_so3(np.array([0, 0, rng.uniform(-2, 2)])), rng.uniform((-0.3, -0.3, 0.1), (0.3, 0.3, 0.7)))
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(motions=st.lists(st.integers(0, 2**32 - 1).map(random_motion), min_size=1, max_size=4))
 def test_unseen_children_move_with_their_supporter(models: Models, track: TrackMaker, motions: list[Float64]) -> None:
     """T_map_child = T_map_supporter T_supporter_child, through two levels, until the child itself is seen."""
@@ -228,7 +228,7 @@ def test_static_surfaces_are_what_the_survey_shows(static_map: StaticMap, models
     assert graph.mesh_distance("relay-1", "workbench").distance == pytest.approx(0.1, abs=1e-6)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_incremental_equals_from_scratch(static_map: StaticMap, models: Models, track: TrackMaker, seed: int) -> None:
     rng = np.random.default_rng(seed)

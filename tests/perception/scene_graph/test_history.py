@@ -16,7 +16,7 @@ relations = st.builds(Relation, st.sampled_from(NAMES), st.sampled_from(["on", "
 changes = st.lists(st.tuples(relations, st.booleans()), max_size=6)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.lists(changes, min_size=1, max_size=8))
 def test_what_held_stays_as_it_was_while_the_history_goes_on(updates: list[list[tuple[Relation, bool]]]) -> None:
     history, held = History(), set[Relation]()

@@ -60,7 +60,7 @@ class Crowd:
         return dict(zip(map(tuple, pairs.tolist()), (holds @ (1 << np.arange(len(RELATIONS)))).tolist(), strict=True))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 2**32 - 1), projection=st.booleans(), strict=st.booleans())
 def test_updates_equal_all_pairs_from_scratch(seed: int, projection: bool, strict: bool) -> None:
     config = RelationConfig(leave_margin=0.0, projection=projection, strict=strict)
@@ -85,7 +85,7 @@ def test_the_table_grows_and_forgets() -> None:
     assert not any(crowd.masks.values())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), leave=st.sampled_from([0.0, 0.002, 0.02]), enter=st.sampled_from([0.0, 0.005]))
 def test_bounds_lie_on_the_side_of_the_margins(seed: int, leave: float, enter: float) -> None:
     """With a limit, margins may be bounds, which decide as the exact ones do: beginning and ending to hold."""

@@ -87,7 +87,7 @@ def test_projection_ends_after_three_and_a_half_lengths() -> None:
     assert relation_margin(at(0, 0.35, 0), "left-of", at(0, 0, 0), CONFIG, strict=True) == pytest.approx(0.0)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(pairs, poses)
 def test_object_centred_directions_keep_under_rigid_motion(pair: list[Body], T: Float64) -> None:
     moved = [replace(body, T_map=T @ body.T_map) for body in pair]
@@ -96,7 +96,7 @@ def test_object_centred_directions_keep_under_rigid_motion(pair: list[Body], T: 
     np.testing.assert_allclose(np.delete(before, skip, 2), np.delete(after, skip, 2), atol=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(pairs, st.booleans(), st.booleans())
 def test_mirroring_the_frames_swaps_left_and_right(pair: list[Body], strict: bool, projection: bool) -> None:
     flip = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -108,7 +108,7 @@ def test_mirroring_the_frames_swaps_left_and_right(pair: list[Body], strict: boo
         assert before[RELATIONS.index(name)] == pytest.approx(after[RELATIONS.index(other)], abs=1e-9)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(pairs)
 def test_strict_implies_relaxed_and_projection_implies_half_space(pair: list[Body]) -> None:
     for name in DIRECTIONS:
@@ -122,7 +122,7 @@ def test_strict_implies_relaxed_and_projection_implies_half_space(pair: list[Bod
         assert holds("in", pair)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(pairs)
 def test_opposite_strict_directions_exclude_each_other(pair: list[Body]) -> None:
     for name, opposite in (("above", "below"), ("left-of", "right-of"), ("in-front-of", "behind")):
@@ -131,7 +131,7 @@ def test_opposite_strict_directions_exclude_each_other(pair: list[Body]) -> None
         )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(pairs)
 def test_distances_relate_near_touching_and_intersects(pair: list[Body]) -> None:
     margins = relation_margins(pair, CONFIG)
@@ -143,7 +143,7 @@ def test_distances_relate_near_touching_and_intersects(pair: list[Body]) -> None
     assert touching or not intersects
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(pairs, st.integers(0, 2**32 - 1))
 def test_margin_bounds_the_motion_that_changes_a_relation(pair: list[Body], seed: int) -> None:
     margins = relation_margins(pair, CONFIG)[0, 1]
@@ -188,7 +188,7 @@ def test_a_fallen_body_carries_on_the_side_that_is_up() -> None:
     assert relation_margin(standing(0.1, lift=0.1, y=0.1), "on", fallen, CONFIG) == pytest.approx(CONFIG.on_distance)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.floats(-3.0, 3.0))
 def test_on_keeps_when_the_scene_turns_about_the_vertical(seed: int, yaw: float) -> None:
     rng = np.random.default_rng(seed)
@@ -251,7 +251,7 @@ def test_a_viewer_straight_above_goes_by_his_image() -> None:
 # ------------------------------------------------------------------------------------------------------ rooms, errors
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1))
 def test_room_margins_agree_with_shapely(seed: int) -> None:
     from shapely import Point, Polygon
@@ -266,7 +266,7 @@ def test_room_margins_agree_with_shapely(seed: int) -> None:
         np.testing.assert_allclose(room_margins(points, Room("r", polygon)), expected, atol=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1))
 def test_points_are_in_the_room_in_which_they_lie_deepest(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -27,7 +27,7 @@ def priority_flood(ground: Float64) -> Float64:
     return level[1:-1, 1:-1]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1))
 def test_water_stands_up_to_the_lowest_way_out(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -178,7 +178,7 @@ def test_answers_about_something_else_are_refused() -> None:
         wire.unpacked_segments(packed, 5, (8, 6))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 def test_whatever_comes_is_read_or_refused(data: st.DataObject) -> None:
     packed = bytearray(wire.packed_frame(frame()))

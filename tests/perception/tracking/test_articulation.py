@@ -97,7 +97,7 @@ def test_the_column_is_the_derivative_of_the_points_along_their_normals(
     np.testing.assert_allclose(joint_column(points, 5, part, T_camera_map), numeric, atol=1e-7)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.05, 0.4, 0.7, 1.2, 1.6, 1.75]), st.floats(0.0, 0.35))
 def test_never_seen_joints_are_found_anywhere_in_their_range(seed: int, door: float, drawer: float) -> None:
     rng = np.random.default_rng(seed)

@@ -107,7 +107,7 @@ def test_a_trapdoor_is_seen_through_from_below_it_and_from_aside() -> None:
         assert regions.reachable(sensor, 5.0)[0].tolist() == [0, 1]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.3, 4.0, 60.0]))
 def test_the_grid_equals_a_search_of_all_boxes(seed: int, distance: float) -> None:
     rng = np.random.default_rng(seed)

@@ -61,7 +61,7 @@ def test_any_count_is_met_from_any_seed_and_repeats(
         np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), width=st.floats(20.0, 80.0), depth=st.floats(20.0, 80.0))
 def test_layouts_fill_the_floor_and_join_every_space(seed: int, width: float, depth: float) -> None:
     import networkx as nx

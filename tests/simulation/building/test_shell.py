@@ -12,7 +12,7 @@ L_SHAPE = np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 3.0], [4.0, 3.0], [4.0, 7.0], 
 COLORS = ((200, 200, 200), (90, 90, 90))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(edge=st.floats(0.2, 3.0))
 def test_a_room_has_its_area_at_any_resolution_and_counts_are_exact(edge: float) -> None:
     room = Room("r", L_SHAPE, 0.0, 2.5)
