@@ -38,16 +38,15 @@ class FitConfig:
     """Fewest silhouette pixels that must have a depth step behind them: a flat side fits any wall."""
     constrained: int = 4
     """Fewest directions that the data must constrain."""
-    rotation_sigma: float = np.deg2rad(4.5)
+    rotation_sigma: float = np.deg2rad(6.0)
     """Largest standard deviation of a constrained orientation, radians: a small thing far away fits in many ways."""
     good_support: float = 0.95
     """A fit with less support than this is tried again from turned starts ..."""
     good_misfit: float = 1.2
     """... and so is one with a larger misfit than this many times that of right poses."""
     misfit: float = 1.3
-    """A fit with a larger misfit than this many times that of right poses (`NoiseLevel`), plus the share of it that is
-    occluded, is not believed: another thing's surface fits worse. What stands closely before a thing, as fingers do,
-    takes in some of its readings."""
+    """A fit with a larger misfit than this many times that of right poses (`NoiseLevel`) is not believed: another
+    thing's surface, or fingers before it, fit worse."""
     near_support: float = 0.8
     """Hypotheses with more support than this are registered as they are, and no others are ..."""
     near_margin: float = 0.8
@@ -98,8 +97,8 @@ def believable(result: RegistrationResult, config: FitConfig, noise: float) -> b
 
 
 def fits_noise(result: RegistrationResult, config: FitConfig, noise: float) -> bool:
-    """Whether a registered pose's residuals are those of the sensor, as far as what stands before it allows."""
-    return result.misfit <= config.misfit * noise + result.occluded / max(result.rays, 1)
+    """Whether a registered pose's residuals are those of the sensor."""
+    return result.misfit <= config.misfit * noise
 
 
 class NoiseLevel:

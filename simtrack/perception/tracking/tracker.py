@@ -182,6 +182,8 @@ class ObjectTracker:
             self._demote(target, view.stamp)
         taken = measurement(view, result, target.last_seen, self.config)
         poor = result.misfit > self.config.poor_misfit
+        # What is held far away fits the fingers before it nearly as well.
+        poor |= target.vague(self.config) and not fits_noise(result, self.config.fit, view.noise)
         if target.known and (poor or self._incredible(target, taken)):
             target.filter.skip(view.stamp)
             target.doubts += 1
