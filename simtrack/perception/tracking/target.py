@@ -139,8 +139,8 @@ class Target:
 
     @property
     def gone(self) -> bool:
-        """Whether it is not believed any more where it was, and no detection has said otherwise since."""
-        return not self.alive or (self.status is TrackStatus.TENTATIVE and self.known and self.detections == 0)
+        """Whether it was known, and is not believed where it was or may be."""
+        return self.known and self.status in (TrackStatus.LOST, TrackStatus.TENTATIVE)
 
     def vague(self, config: TrackerConfig) -> bool:
         """Whether the depth image determines its orientation too poorly to outweigh detections."""
