@@ -51,6 +51,8 @@ class PanopticEntity:
     """(N, 3), map frame, metres, evenly over the surface."""
     box: OrientedBox
     """Upright, around all of it."""
+    mesh: Mesh | None = None
+    """What the points are of, where it is known: it is what is near to other points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,9 +131,8 @@ def _spread(mesh: Mesh, number: int, rng: np.random.Generator) -> Float64:
 
 def predicted_entity(name: str, semantic_class: str, score: float, mesh: Mesh) -> PanopticEntity:
     """An entity of a map as it is compared: its points one a cell."""
-    return PanopticEntity(
-        name, semantic_class, score, _spread(mesh, 0, np.random.default_rng(0)), upright_box(mesh.vertices)
-    )
+    points = _spread(mesh, 0, np.random.default_rng(0))
+    return PanopticEntity(name, semantic_class, score, points, upright_box(mesh.vertices), mesh)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,22 +175,42 @@ def compare(predicted: Sequence[PanopticEntity], true: TrueSurface, lenient: boo
         return Comparison(tuple(predicted), true, np.zeros(shape, np.int32), sizes[0], sizes[1].astype(np.int32),
                           np.full(len(points), np.inf), far)  # fmt: skip
     accuracy, nearest_true = _nearest(surface, points)
-    completeness, nearest = _nearest(points, surface)
+    completeness, owners = _nearest_entity(predicted, surface)
     if lenient:
         pairs = of_point * shape[1] + of_surface[nearest_true]
         sizes = np.bincount(of_point, minlength=shape[0])
         true_sizes = np.bincount(of_surface[nearest_true], minlength=shape[1])
     else:
         near = completeness <= REACH
-        pairs = of_point[nearest[near]] * shape[1] + of_surface[near]
+        pairs = owners[near] * shape[1] + of_surface[near]
         wrong = np.bincount(of_point[accuracy > REACH], minlength=shape[0])
-        sizes = np.bincount(of_point[nearest[near]], minlength=shape[0]) + wrong
+        sizes = np.bincount(owners[near], minlength=shape[0]) + wrong
         true_sizes = np.bincount(of_surface, minlength=shape[1])
     common = np.bincount(pairs, minlength=shape[0] * shape[1]).reshape(shape)
     return Comparison(
         tuple(predicted), true, common.astype(np.int32), sizes.astype(np.int32), true_sizes.astype(np.int32),
         accuracy, completeness,
     )  # fmt: skip
+
+
+def _nearest_entity(entities: Sequence[PanopticEntity], queries: Float64) -> tuple[Float64, np.ndarray]:
+    """(Q,) distances to the nearest surface, and whose it is; points stand for entities without a mesh."""
+    from simtrack.raycast import RayScene, TriangleMesh
+
+    distances, owners = np.full(len(queries), np.inf), np.zeros(len(queries), np.int64)
+    meshes = {k: e.mesh for k, e in enumerate(entities) if e.mesh is not None and len(e.mesh.faces)}
+    if meshes:
+        with RayScene() as scene:
+            for k, mesh in meshes.items():
+                scene.add(TriangleMesh(mesh.vertices, mesh.faces, entities[k].name), instance=k)
+            found = scene.closest_points(queries)
+            distances, owners = found.distances.astype(float), found.instances.astype(np.int64)
+    for k, entity in enumerate(entities):
+        if k not in meshes and len(entity.points):
+            off, _ = _nearest(entity.points, queries)
+            owners[off < distances] = k
+            distances = np.minimum(distances, off)
+    return distances, owners
 
 
 def _nearest(points: Float64, queries: Float64) -> tuple[Float64, np.ndarray]:

@@ -155,6 +155,8 @@ def scores_from_json(document: Mapping[str, Any]) -> MapScores:
         completeness=float(document["completeness"]),
         distance=int(document["distance"]),
         nodes=int(document["nodes"]),
+        edits=int(document.get("edits", 0)),
+        distance_by_class=int(document.get("distance_by_class", 0)),
     )
 
 
@@ -180,6 +182,8 @@ def summed(scores: Sequence[MapScores]) -> MapScores:
         completeness=float(np.mean([each.completeness for each in scores])),
         distance=sum(each.distance for each in scores),
         nodes=sum(each.nodes for each in scores),
+        edits=sum(each.edits for each in scores),
+        distance_by_class=sum(each.distance_by_class for each in scores),
     )
 
 
@@ -238,18 +242,21 @@ def precision_table(total: Mapping[str, MapScores], boxes: bool) -> tuple[list[s
 
 
 def table_5(done: Mapping[RoomMapTask, Results]) -> tuple[list[str], list[list[str]]]:
-    """As Table 5: distance of the contact graph of the full method's map, 2 W + M + E."""
+    """As Table 5: distance of the contact graph of the full method's map, 2 W + M + E; by class; five operations."""
     rows = [
         [
             task.room,
             str(r["full"].nodes),
-            str(r["full"].distance),
-            f"{r['full'].distance / max(r['full'].nodes, 1):.2f}",
+            *(
+                text
+                for value in (r["full"].distance, r["full"].distance_by_class, r["full"].edits)
+                for text in (str(value), f"{value / max(r['full'].nodes, 1):.2f}")
+            ),
         ]
         for task, r in done.items()
         if "full" in r
     ]
-    return ["room", "nodes", "distance", "per node"], rows
+    return ["room", "nodes", "distance", "per node", "by class", "per node", "edits", "per node"], rows
 
 
 def ordering(done: Mapping[RoomMapTask, Results], better: str, worse: str) -> tuple[int, int]:

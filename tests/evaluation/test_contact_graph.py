@@ -70,9 +70,12 @@ def test_any_of_several_supporters_is_right() -> None:
     assert contact_graph_errors(other, truth).total == 0
 
 
-def test_a_class_is_a_substitution_in_the_general_distance_alone() -> None:
+def test_a_wrong_class_is_one_substitution_and_two_where_nodes_are_matched_by_class() -> None:
     named = SupportTree({**TRUE.classes, "cup": "bowl"}, TRUE.parents)
-    assert (contact_graph_errors(named, TRUE).total, contact_graph_errors(named, TRUE).general) == (0, 1)
+    errors = contact_graph_errors(named, TRUE)
+    assert errors.wrong_class == ("cup",) and (errors.total, errors.general) == (1, 1)
+    by_class = contact_graph_errors(named, TRUE, {name: name for name in TRUE.classes if name != "cup"})
+    assert (by_class.missing, by_class.extra, by_class.total) == (("cup",), ("cup",), 2)
     assert optimal_edit_distance(named, TRUE) == 1.0
 
 

@@ -28,7 +28,8 @@ from simtrack.evaluation.panoptic_rooms import (
     tables_of,
     write_panoptic,
 )
-from simtrack.geometry.meshes import Mesh, box_mesh
+from simtrack.geometry.meshes import Mesh, box_mesh, sample_surface
+from simtrack.raycast import RayScene, TriangleMesh
 
 
 def entity(name: str, x: float, size: float = 0.4, score: float = 1.0) -> PanopticEntity:
@@ -50,6 +51,34 @@ def test_the_truth_itself_is_perfect() -> None:
     assert np.allclose(found.iou, np.eye(3)) and found.accuracy.max() == 0.0
     assert mean_precision(scored_classes(TRUE.entities, TRUE, found.iou)) == 1.0
     assert np.allclose(box_iou(TRUE.entities, TRUE), np.eye(3))
+
+
+def test_the_true_meshes_are_perfect_however_small_and_close_they_are() -> None:
+    sizes = {
+        "table1": (1.0, 0.6, 0.5),
+        "book1": (0.15, 0.03, 0.2),
+        "book2": (0.15, 0.025, 0.2),
+        "cup1": (0.07, 0.07, 0.09),
+    }
+    places = {
+        "table1": (0.0, 0.0, 0.25),
+        "book1": (0.0, 0.0, 0.6),
+        "book2": (0.0, 0.0275, 0.6),
+        "cup1": (0.2, 0.1, 0.545),
+    }
+    meshes = {n: Mesh(box_mesh(s).vertices + np.array(places[n]), box_mesh(s).faces) for n, s in sizes.items()}
+    entities = [predicted_entity(n, n[:-1], 1.0, mesh) for n, mesh in meshes.items()]
+    # Seen from above and the sides: another sample, not of the faces that lie on each other.
+    rng, seen = np.random.default_rng(1), []
+    for mine, mesh in zip(entities, meshes.values(), strict=True):
+        points = sample_surface(mesh, 4000, rng)[0]
+        with RayScene() as others:
+            for number, (name, other) in enumerate(meshes.items()):
+                if name != mine.name:
+                    others.add(TriangleMesh(other.vertices, other.faces), instance=number)
+            free = others.closest_points(points).distances > 1e-3
+        seen.append(replace(mine, points=points[free], mesh=None))
+    assert np.diag(compare(entities, truth(*seen)).iou).min() > 0.999
 
 
 def test_missing_wrong_and_renamed_entities_are_counted() -> None:

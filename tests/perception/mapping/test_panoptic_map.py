@@ -1,5 +1,6 @@
 """The panoptic map: surfaces come back, segments keep their labels, counts decide, nonsense changes nothing."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,14 @@ from simtrack.errors import FileFormatError, InvalidValueError
 from simtrack.geometry.meshes import Mesh, box_mesh, face_areas, face_normals
 from simtrack.geometry.transforms import look_at
 from simtrack.perception.mapping.panoptic.association import SegmentLabels
-from simtrack.perception.mapping.panoptic.counts import CountsConfig, JointCounts, Observation, SeparateCounts
-from simtrack.perception.mapping.panoptic.entities import MapEntityMesh, extract_surface
+from simtrack.perception.mapping.panoptic.counts import (
+    CountsConfig,
+    JointCounts,
+    Observation,
+    SegmentEntity,
+    SeparateCounts,
+)
+from simtrack.perception.mapping.panoptic.entities import EntityConfig, MapEntityMesh, _least_observed, extract_surface
 from simtrack.perception.mapping.panoptic.files import read_entities, write_entities
 from simtrack.perception.mapping.panoptic.frame_segments import SILENT, FrameFusionConfig, fuse_segments
 from simtrack.perception.mapping.panoptic.layout import split_layout
@@ -157,6 +164,34 @@ def test_only_the_largest_cluster_stays_with_a_thing(gap: float, kept: bool) -> 
     assert stuff.instances[stuff.image[0, 150]] == 1
 
 
+def test_masks_that_are_known_to_be_good_have_all_their_readings() -> None:
+    # The foot of a monitor is in one geometric segment with the table.
+    geometric = np.ones((120, 160), np.int32)
+    geometric[10:60, 50:110] = 2
+    image = np.ones((120, 160), np.int32)
+    image[10:60, 50:110] = image[60:70, 70:90] = 2
+    panoptic = PanopticSegments(0, image, ("table", "monitor"), np.ones(2, np.float32))
+    depth = np.ones((120, 160), np.float32)
+    doubted = fuse_segments(geometric, panoptic, depth, CAMERA)
+    assert doubted.instances[doubted.image[65, 80]] == 1
+    trusted = fuse_segments(geometric, panoptic, depth, CAMERA, trust=True)
+    assert (trusted.instances[trusted.image] == image).all() and trusted.sizes.sum() == image.size
+    assert trusted.agreement == doubted.agreement == (image.size - 200, image.size)
+
+
+@pytest.mark.parametrize(
+    ("method", "shift", "follows"), [("full", 0, True), ("full", 25, False), ("no-joint-fusion", 0, False)]
+)
+def test_masks_are_known_to_be_good_where_depth_agrees_with_them(method: Method, shift: int, follows: bool) -> None:
+    panoptic_map = PanopticMap(PanopticMapConfig.of_method(method, 0.05))
+    for frame, T, segments in views(3):
+        off = replace(segments, image=np.roll(segments.image, shift, axis=1))
+        panoptic_map.integrate(frame, T, off)
+    own, whole = panoptic_map.agreement
+    fusion = panoptic_map.config.fusion
+    assert (fusion.trust and own >= fusion.trusted * whole > 0) is follows
+
+
 # ------------------------------------------------------------------------------------------------- labels and counts
 
 
@@ -212,6 +247,47 @@ def test_instances_that_share_their_segments_are_merged() -> None:
     counts.phi = {1: {("chair", 1): 5, ("chair", 2): 4}, 2: {("chair", 1): 1}, 3: {("chair", 7): 9}}
     counts.regularize()
     assert counts.phi[1] == {("chair", 1): 9} and counts.phi[3] == {("chair", 7): 9}
+
+
+def test_instances_that_things_were_both_of_are_merged_unless_they_were_things_of_their_own() -> None:
+    plants, chairs = JointCounts(), JointCounts()
+    for counts, name in ((plants, "plant"), (chairs, "chair")):
+        counts.observe([Observation(name, (1,))])
+        counts.observe([Observation(name, (2,))])
+    for _ in range(3):
+        plants.observe([Observation("plant", (1, 2))])
+        chairs.observe([Observation("chair", (1, 2))])
+        for _ in range(2):
+            chairs.observe([Observation("chair", (1,)), Observation("chair", (2,))])
+    restored = JointCounts()
+    restored.restore(json.loads(json.dumps(plants.state())))
+    for counts in (plants, restored, chairs):
+        counts.regularize()
+    for counts in (plants, restored):
+        assert counts.entities()[1].instance == counts.entities()[2].instance
+    assert chairs.entities()[1].instance != chairs.entities()[2].instance
+
+
+def test_segments_of_one_entity_and_what_was_merged_support_each_other_in_a_voxel() -> None:
+    counts = JointCounts()
+    counts.observe([Observation("chair", (1, 2)), Observation("table", (3,))])
+    same = counts.same(np.array([0, 1, 2, 3, 4, 3], np.int32))
+    assert same[1] == same[2] and same[3] == same[5] and len(set(same.tolist())) == 4
+    frame, T, _ = views(1)[0]
+    label = np.ones((120, 160), np.int32)
+    for alike, support in ((same, 2), (None, 0)):
+        volume = Volume(VolumeConfig(voxel=VOXEL))
+        volume.integrate(frame.depth, None, label, CAMERA, T, same)
+        volume.integrate(frame.depth, None, 2 * label, CAMERA, T, alike)
+        held = volume.support[: volume.count][volume.labels[: volume.count] == 1]
+        assert len(held) > 1000 and (held == support).all()
+
+
+def test_the_doubt_that_things_are_held_in_follows_from_how_often_observations_disagree() -> None:
+    def least(agreeing: int) -> int:
+        return _least_observed({1: SegmentEntity("cup", 1, agreeing, 100)}, EntityConfig())
+
+    assert [least(100), least(97), least(85), least(50)] == [1, 1, 2, 3]
 
 
 # ---------------------------------------------------------------------------------------------------------------- files

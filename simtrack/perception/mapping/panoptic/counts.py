@@ -7,9 +7,12 @@ what the paper compares with: Phi(l, c) and Phi(l, p) by themselves, as in Voxbl
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, Protocol
 
 import numpy as np
+
+from simtrack.contracts import Int32
 
 BACKGROUND = ""
 """Class of what no panoptic segment covers."""
@@ -53,6 +56,14 @@ class PanopticCounts(Protocol):
         """Whether nothing that was observed speaks against two global segments being one."""
         ...
 
+    def same(self, canonical: Int32) -> Int32:
+        """(L,) numbers, equal for global segments that are the same as far as is known.
+
+        Args:
+            canonical: (L,), the global segment that each one is part of.
+        """
+        ...
+
     def regularize(self) -> None:
         """Merge instances that are one."""
         ...
@@ -83,6 +94,10 @@ class CountsConfig:
     common: float = 0.25
     """Share of a segment's counts for a class that each of two instances needs for the segment to be common to both.
     The paper has 0: then one frame that takes two chairs for one makes their segments common."""
+    together: int = 3
+    """Things of frames that lay on segments of two instances for these to be one ..."""
+    apart: float = 2.0
+    """... and how many times the frames it must be in which each was a thing of its own."""
     labelled: float = 0.35
     """Share of the frames that see a segment in which something must cover it, for it not to be background."""
 
@@ -96,6 +111,12 @@ class JointCounts:
         """l -> (c, p) -> count."""
         self._stuff: dict[str, int] = {}
         self._fresh = 1
+        self._together: dict[tuple[int, int], int] = defaultdict(int)
+        """Pairs of instances, the older first -> things of frames that lay on segments of both ..."""
+        self._apart: dict[tuple[int, int], int] = defaultdict(int)
+        """... and frames in which each was a thing of its own."""
+        self._entities: dict[int, SegmentEntity | None] = {}
+        """What was found of `phi` as it is."""
 
     def observe(self, observations: Sequence[Observation]) -> None:
         """Section 3.2 and Eq. 4.
@@ -122,9 +143,11 @@ class JointCounts:
             if number not in found and p not in taken:
                 found[number] = p
                 taken.add(p)
+        self._compare(observations, {number: p for number, p in found.items() if p in taken})
         for number, seen in enumerate(observations):
             p = found[number] if number in found else self._new()
             for label in seen.labels:
+                self._entities.pop(label, None)
                 counts = self.phi[label]
                 counts[seen.semantic_class, p] = counts.get((seen.semantic_class, p), 0) + 1
 
@@ -133,6 +156,18 @@ class JointCounts:
         counts = self.phi[into]
         for key, count in self.phi.pop(label, {}).items():
             counts[key] = counts.get(key, 0) + count
+        self._entities.pop(label, None)
+        self._entities.pop(into, None)
+
+    def same(self, canonical: Int32) -> Int32:
+        """Global segments of one entity are the same."""
+        numbers: dict[tuple[str, int], int] = {}
+        own = np.arange(len(canonical), dtype=np.int32)
+        for label in self.phi:
+            entity = self._entity(label)
+            if entity is not None:
+                own[label] = len(canonical) + numbers.setdefault(_key(entity), len(numbers))
+        return own[canonical]
 
     def alike(self, label: int, other: int) -> bool:
         """Whether both are the same entity, or one of them none."""
@@ -159,6 +194,7 @@ class JointCounts:
                 if share[first, second] < config.merge_share:
                     break
                 self._merge_instances(name, instances[max(first, second)], instances[min(first, second)])
+        self._merge_seen_as_one()
 
     def entities(self) -> Mapping[int, SegmentEntity]:
         """Eq. 6."""
@@ -168,7 +204,11 @@ class JointCounts:
     def state(self) -> dict[str, Any]:
         """All that was counted, as plain data."""
         rows = [[label, c, p, n] for label, counts in sorted(self.phi.items()) for (c, p), n in sorted(counts.items())]
-        return {"phi": rows, "stuff": dict(self._stuff), "fresh": self._fresh}
+        pairs = {
+            name: [[*pair, n] for pair, n in sorted(table.items())]
+            for name, table in (("together", self._together), ("apart", self._apart))
+        }
+        return {"phi": rows, "stuff": dict(self._stuff), "fresh": self._fresh, **pairs}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Take what `state` told."""
@@ -176,9 +216,48 @@ class JointCounts:
         for label, name, p, count in state["phi"]:
             phi[int(label)][str(name), int(p)] = int(count)
         self._stuff = {str(name): int(p) for name, p in state["stuff"].items()}
-        self.phi, self._fresh = phi, int(state["fresh"])
+        self._together, self._apart = (
+            defaultdict(int, {(int(p), int(q)): int(n) for p, q, n in state.get(name, ())})
+            for name in ("together", "apart")
+        )
+        self.phi, self._fresh, self._entities = phi, int(state["fresh"]), {}
+
+    def _compare(self, observations: Sequence[Observation], found: Mapping[int, int]) -> None:
+        """Note which known instances a thing of the frame lies on, and which are things of their own."""
+        of_class: dict[str, list[int]] = defaultdict(list)
+        for number, p in found.items():
+            name = observations[number].semantic_class
+            of_class[name].append(p)
+            best = {p}
+            for label in observations[number].labels:
+                counts = [(count, -q) for (c, q), count in self.phi[label].items() if c == name]
+                if counts:
+                    best.add(-max(counts)[1])
+            _add_pairs(self._together, best)
+        for members in of_class.values():
+            _add_pairs(self._apart, members)
+
+    def _merge_seen_as_one(self) -> None:
+        """Merge instances that things of frames were both of, and that were seldom things of their own at a time."""
+        while True:
+            ready = [
+                (n, pair)
+                for pair, n in self._together.items()
+                if n >= self.config.together and n >= self.config.apart * self._apart.get(pair, 0)
+            ]
+            if not ready:
+                return
+            _, (into, p) = max(ready, key=lambda each: (each[0], [-k for k in each[1]]))
+            names = {c for counts in self.phi.values() for c, q in counts if q == p}
+            for name in names:
+                self._merge_instances(name, p, into)
 
     def _entity(self, label: int) -> SegmentEntity | None:
+        if label not in self._entities:
+            self._entities[label] = self._found_entity(label)
+        return self._entities[label]
+
+    def _found_entity(self, label: int) -> SegmentEntity | None:
         classes: dict[str, int] = defaultdict(int)
         counts = self.phi.get(label, {})
         for (name, _), count in counts.items():
@@ -206,6 +285,12 @@ class JointCounts:
             count = counts.pop((name, p), 0)
             if count:
                 counts[name, into] = counts.get((name, into), 0) + count
+        self._entities.clear()
+        for table in (self._together, self._apart):
+            for pair in [pair for pair in table if p in pair]:
+                count, other = table.pop(pair), pair[0] + pair[1] - p
+                if other != into:
+                    table[min(other, into), max(other, into)] += count
 
     def _stuff_instance(self, name: str) -> int:
         if name not in self._stuff:
@@ -250,6 +335,10 @@ class SeparateCounts:
     def alike(self, label: int, other: int) -> bool:
         """Always: geometry alone decides."""
         return True
+
+    def same(self, canonical: Int32) -> Int32:
+        """Only what was merged is the same."""
+        return canonical
 
     def regularize(self) -> None:
         """Nothing: instances are not merged."""
@@ -304,6 +393,11 @@ class SeparateCounts:
 
 def _key(entity: SegmentEntity) -> tuple[str, int]:
     return entity.semantic_class, entity.instance
+
+
+def _add_pairs(table: dict[tuple[int, int], int], members: Iterable[int]) -> None:
+    for pair in combinations(sorted(members), 2):
+        table[pair] += 1
 
 
 def _winner(classes: Mapping[str, int], labelled: float) -> str | None:

@@ -32,8 +32,11 @@ class EntityConfig:
     enough_support: float = 2.5
     """... unless it has so much."""
     least_observed: int = 3
-    """Observations of one of its segments that must agree on what a thing is; what fewer say is dropped."""
-    least_area: float = 0.006
+    """Observations of one of its segments that must agree on what a thing is; what fewer say is dropped ..."""
+    doubt: float = 0.05
+    """... unless fewer are enough for this chance that all are wrong, each as often as observations disagree with what
+    their segments are taken for."""
+    least_area: float = 0.002
     """Square metres; smaller entities are dropped."""
     gap: float = 0.06
     """Metres between pieces of a thing that hang together."""
@@ -48,7 +51,7 @@ class EntityConfig:
         for name in ("least_weight", "least_area", "gap", "enough_support"):
             if not 0.0 < getattr(self, name) < 1e6:
                 raise InvalidValueError(f"EntityConfig.{name}", getattr(self, name), "a finite number > 0")
-        for name in ("least_support", "least_piece"):
+        for name in ("least_support", "least_piece", "doubt"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"EntityConfig.{name}", getattr(self, name), "a share, 0 to 1")
 
@@ -136,7 +139,8 @@ def extract_entities(
     for each in entities.values():
         parts[each.semantic_class, each.instance].append(each)
     agreeing = {key: max(each.agreeing for each in found) for key, found in parts.items()}
-    sure = {key for key, most in agreeing.items() if key[0] in STUFF_FIRST or most >= config.least_observed}
+    least = _least_observed(entities, config)
+    sure = {key for key, most in agreeing.items() if key[0] in STUFF_FIRST or most >= least}
     parts = {key: found for key, found in parts.items() if key in sure}
     entities = {label: each for label, each in entities.items() if (each.semantic_class, each.instance) in sure}
     keys = sorted(parts, key=lambda key: (key[0] not in STUFF_FIRST, *key))
@@ -164,6 +168,16 @@ def extract_entities(
             agreeing, observed = sum(e.agreeing for e in parts[name, p]), sum(e.observed for e in parts[name, p])
             found.append(MapEntityMesh(f"{name}{running[name]}", name, p, agreeing / observed, mesh))
     return tuple(found)
+
+
+def _least_observed(entities: Mapping[int, SegmentEntity], config: EntityConfig) -> int:
+    """Observations that a thing needs, see `EntityConfig.doubt`."""
+    things = [each for each in entities.values() if each.semantic_class not in STUFF_FIRST]
+    observed, agreeing = sum(each.observed for each in things), sum(each.agreeing for each in things)
+    wrong = (observed - agreeing + 1) / (observed + 2)  # rule of succession: of few, little is known
+    if config.doubt <= 0.0:
+        return config.least_observed
+    return int(np.clip(np.ceil(np.log(config.doubt) / np.log(wrong)), 1, config.least_observed))
 
 
 def _part(surface: Surface, chosen: np.ndarray) -> Mesh:

@@ -6,7 +6,7 @@ of one thing only the largest Euclidean cluster stays with it (the floor behind 
 """
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,12 @@ class FrameFusionConfig:
     the segments of the mask beside them, or make segments of their own."""
     step: float = 0.02
     """Share of the depth by which such readings differ from those beside them."""
+    trust: bool = True
+    """Whether masks that are known to be good have all their readings, whatever segment those are in: the foot of a
+    monitor is in one with the table, and what stands on a table has some of it around its own."""
+    trusted: float = 0.97
+    """Share of the readings of things' masks, in all frames so far, that must be in segments of theirs for masks to be
+    known to be good: borders that were drawn wrong do not follow edges in depth."""
     cluster: bool = True
     """Whether things keep only their largest cluster."""
     silent: bool = True
@@ -56,7 +62,7 @@ class FrameFusionConfig:
     """Square metres, seen from the camera, of a segment that is large."""
 
     def __post_init__(self) -> None:
-        for name in ("inside", "part", "covered"):
+        for name in ("inside", "part", "covered", "trusted"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"FrameFusionConfig.{name}", getattr(self, name), "a share, 0 to 1")
         if not 0.0 < self.step < 1.0:
@@ -76,12 +82,12 @@ class FrameFusionConfig:
         """Section 3.1 alone: masks are split out of segments that contain them, what is not in the largest cluster of a
         thing is background, and nothing is filled in or held to planes.
         """
-        return FrameFusionConfig(inside=0.9, fill=False, silent=False, hidden=(0.0, 0.0), flat=False)
+        return FrameFusionConfig(inside=0.9, fill=False, trust=False, silent=False, hidden=(0.0, 0.0), flat=False)
 
     @staticmethod
     def of_voxbloxpp() -> "FrameFusionConfig":
         """Geometric segments take the mask that covers most of them, and that is all."""
-        return FrameFusionConfig(split=False, fill=False, cluster=False, flat=False)
+        return FrameFusionConfig(split=False, fill=False, trust=False, cluster=False, flat=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +103,9 @@ class FrameSegments:
     """(N + 1,): readings."""
     geometric: Bool
     """(N + 1,): whether depth alone drew it; else a mask did, wherever that leaks to."""
+    agreement: tuple[int, int] = (0, 0)
+    """Readings of things' masks in segments that depth drew and that are theirs, or that are split out for them; and of
+    all that are in segments."""
 
     def __len__(self) -> int:
         return len(self.instances) - 1
@@ -109,6 +118,7 @@ def fuse_segments(
     intrinsics: CameraIntrinsics,
     stuff: Set[str] = frozenset(),
     config: FrameFusionConfig | None = None,
+    trust: bool = False,
 ) -> FrameSegments:
     """Fuse the two segmentations of a frame.
 
@@ -119,6 +129,7 @@ def fuse_segments(
         intrinsics: of the image.
         stuff: classes whose segments need not hang together.
         config: settings, the defaults if None.
+        trust: whether masks are known to be good, see `FrameFusionConfig.trusted`.
     """
     config = config or FrameFusionConfig()
     read, masks = depth > 0.0, len(panoptic)
@@ -141,15 +152,21 @@ def fuse_segments(
     image = np.where(read, numbers[table].ravel()[pairs], 0).astype(np.int32)
     kept = np.concatenate([[0], np.flatnonzero(sizes > 0)])
     segments = FrameSegments(image, instances[kept], sizes[kept], kept < len(joint))
+    thing = np.array([False, *(name not in stuff for name in panoptic.classes)])
+    own = np.where(np.arange(masks + 1) == instances[table], joint, 0)
+    # What is on edges, in no geometric segment, says nothing.
+    agreement = int(own[:, thing].sum()), int(joint[1:, thing].sum() + np.where(extracted, joint, 0)[0, thing].sum())
     if config.fill and masks:
         segments = _filled(segments, panoptic.image, depth, config.step, least)
+    if config.trust and trust and masks:
+        segments = _taken_back(segments, panoptic.image, masks, least)
     if config.cluster and masks:
         things = [k + 1 for k, name in enumerate(panoptic.classes) if name not in stuff]
         _keep_largest_clusters(segments, panoptic.image, things, depth, intrinsics, config)
     if config.flat:
         for number in (k + 1 for k, name in enumerate(panoptic.classes) if name in stuff):
             _keep_planes(segments, number, depth, intrinsics, config)
-    return segments
+    return replace(segments, agreement=agreement)
 
 
 def _keep_planes(
@@ -194,6 +211,28 @@ def _filled(segments: FrameSegments, masks: Int32, depth: Float32, step: float, 
     sizes[0] = 0
     geometric = np.concatenate([segments.geometric, np.zeros(len(more), np.bool_)])
     return FrameSegments(image, instances, sizes, geometric)
+
+
+def _taken_back(segments: FrameSegments, masks: Int32, count: int, least: int) -> FrameSegments:
+    """The segments, with readings of a mask that are in others' given to the largest segment of the mask.
+
+    A mask that has none makes a new one of them.
+    """
+    image, instances = segments.image, segments.instances
+    stray = (masks > 0) & (image > 0) & (instances[image] != masks)
+    main = np.zeros(count + 1, np.int32)
+    for number in np.argsort(segments.sizes, kind="stable").tolist():
+        if instances[number] > 0 and segments.sizes[number] > 0:
+            main[instances[number]] = number
+    strays = np.bincount(masks[stray], minlength=count + 1)
+    more = np.flatnonzero((main == 0) & (strays >= least))
+    main[more] = len(instances) + np.arange(len(more))
+    moved = stray & (main[masks] > 0)
+    image[moved] = main[masks[moved]]
+    instances = np.concatenate([instances, more]).astype(np.int32)
+    sizes = np.bincount(image.ravel(), minlength=len(instances)).astype(np.int32)
+    sizes[0] = 0
+    return FrameSegments(image, instances, sizes, np.concatenate([segments.geometric, np.zeros(len(more), np.bool_)]))
 
 
 def _extracted(joint: np.ndarray, least: int, config: FrameFusionConfig) -> np.ndarray:

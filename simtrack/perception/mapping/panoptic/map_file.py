@@ -32,6 +32,7 @@ def write_map(panoptic_map: PanopticMap, path: Path) -> None:
         "counts": panoptic_map.counts.state(),
         "together": panoptic_map.labels.state(),
         "frames": panoptic_map.frames,
+        "agreement": panoptic_map.agreement,
         "skipped": panoptic_map.skipped,
     }
     arrays = {**panoptic_map.volume.blocks(), "canonical": panoptic_map.labels.canonical}
@@ -60,6 +61,8 @@ def read_map(path: Path) -> PanopticMap:
         panoptic_map.labels.restore(document["together"])
         panoptic_map.counts.restore(document["counts"])
         panoptic_map.frames = int(document["frames"])
+        own, whole = document.get("agreement", (0, 0))
+        panoptic_map.agreement = int(own), int(whole)
         panoptic_map.skipped = {str(reason): int(n) for reason, n in document["skipped"].items()}
     except FileFormatError:
         raise

@@ -115,6 +115,8 @@ class PanopticMap:
         self.counts: PanopticCounts = counts(self.config.counts)
         self.frames = 0
         """Frames that were fused."""
+        self.agreement = (0, 0)
+        """Readings of things' masks that depth agreed with, and all; see `FrameSegments`."""
         self.skipped: dict[str, int] = {}
         """Reason -> frames that were not."""
         self._fused: tuple[int, Float64] | None = None
@@ -152,10 +154,16 @@ class PanopticMap:
         if geometric is None:
             geometric = depth_segments(depth, frame.intrinsics, self.config.geometric)
         stuff = self.config.counts.stuff
-        segments = fuse_segments(geometric, panoptic, depth, frame.intrinsics, stuff, self.config.fusion)
+        own, whole = self.agreement
+        trust = whole > 0 and own >= self.config.fusion.trusted * whole
+        segments = fuse_segments(geometric, panoptic, depth, frame.intrinsics, stuff, self.config.fusion, trust)
         stride = max(1, round(frame.intrinsics.width / 320))
         if self.regions is not None:
             self.regions.approach(now[1][:3, 3])
+        try:
+            self.volume.touched(depth, frame.intrinsics, T_map_camera)
+        except InvalidValueError as error:
+            return self._skip(frame, str(error))
         met, counts = self.volume.overlaps(
             depth, segments.image, frame.intrinsics, T_map_camera, self.labels.canonical, stride
         )
@@ -163,13 +171,12 @@ class PanopticMap:
             1, round(self.config.association.least_readings * (frame.intrinsics.width / 640.0 * 2 / stride) ** 2)
         )
         labels = self.labels.associate(met, counts, least)
-        image = labels[segments.image]
-        try:
-            blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera)
-        except InvalidValueError as error:
-            return self._skip(frame, str(error))
         self._fused = now
+        self.agreement = own + segments.agreement[0], whole + segments.agreement[1]
         self.counts.observe(_observations(segments, labels, panoptic))
+        same = self.counts.same(self.labels.canonical)
+        image = labels[segments.image]
+        blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera, same)
         for label, other in self.labels.count_overlaps(met, counts[segments.geometric], least):
             self._merge(label, other)
         self.frames += 1

@@ -106,8 +106,9 @@ class Volume:
         return met, counts[:, :used]
 
     def integrate(
-        self, depth: Float32, rgb: Uint8 | None, labels: Int32, intrinsics: CameraIntrinsics, T_map_camera: Float64
-    ) -> int:
+        self, depth: Float32, rgb: Uint8 | None, labels: Int32, intrinsics: CameraIntrinsics, T_map_camera: Float64,
+        same: Int32 | None = None,
+    ) -> int:  # fmt: skip
         """Fuse one image; the results do not depend on the number of threads.
 
         Args:
@@ -116,6 +117,7 @@ class Volume:
             labels: (H, W), of segments; 0 = none.
             intrinsics: of the image.
             T_map_camera: (4, 4).
+            same: (L,), labels with the same number support each other in a voxel; None: each stands for itself.
 
         Returns:
             Blocks that it was fused into.
@@ -123,13 +125,16 @@ class Volume:
         Raises:
             InvalidValueError: more blocks would be needed than are allowed; the volume is as it was.
         """
-        listed = self._touched(depth, intrinsics, T_map_camera)
+        listed = self.touched(depth, intrinsics, T_map_camera)
+        if same is None:
+            most = max(int(self.labels[: self.count].max(initial=0)), int(labels.max(initial=0)))
+            same = np.arange(most + 1, dtype=np.int32)
         config = self.config
         image = np.empty((0, 0, 3), np.uint8) if rgb is None else np.ascontiguousarray(rgb)
         voxel, camera = config.voxel, _camera(intrinsics)
         arguments = (
             depth, image, labels, camera, inverse(T_map_camera), voxel, config.truncation * voxel,
-            config.label_band * voxel, (_MOST_WEIGHT, _MOST_SUPPORT),
+            config.label_band * voxel, (_MOST_WEIGHT, _MOST_SUPPORT), same,
             self.keys, self.distances, self.weights, self.colors, self.labels, self.support,
         )  # fmt: skip
         threads = nb.get_num_threads()
@@ -185,8 +190,12 @@ class Volume:
         self._seen[: self.count] = -1
         self._rehash(len(self.keys))
 
-    def _touched(self, depth: Float32, intrinsics: CameraIntrinsics, T_map_camera: Float64) -> Int32:
-        """(B,) blocks within reach of the readings, created where missing."""
+    def touched(self, depth: Float32, intrinsics: CameraIntrinsics, T_map_camera: Float64) -> Int32:
+        """(B,) blocks within reach of the readings, created where missing.
+
+        Raises:
+            InvalidValueError: more blocks would be needed than are allowed; the volume is as it was.
+        """
         config = self.config
         # Neighbouring rays stay within half a block of each other up to 5 m.
         stride = int(np.clip(0.5 * kernels.SIDE * config.voxel * intrinsics.fx / 5.0, 1, 8))

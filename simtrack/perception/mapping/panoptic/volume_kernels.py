@@ -127,7 +127,7 @@ def touch(depth, camera, T_map_camera, voxel, truncation, stride, keys, table, s
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def integrate(
-    listed, depth, rgb, segments, camera, T_camera_map, voxel, truncation, band, limits,
+    listed, depth, rgb, segments, camera, T_camera_map, voxel, truncation, band, limits, same,
     keys, distances, weights, colors, labels, support,
 ):  # fmt: skip
     """Fuse one image into the listed blocks: weighted means of distance and colour, majority of labels.
@@ -143,6 +143,7 @@ def integrate(
         truncation: metres.
         band: metres from the surface within which voxels take labels.
         limits: largest weight of a voxel, most observations that a label is remembered for.
+        same: (L,) int32, labels with the same number support each other.
         keys: (C,) int64, of blocks.
         distances: (C, 512) float32, metres, positive before the surface; output, as what follows.
         weights: (C, 512) float32.
@@ -206,7 +207,7 @@ def integrate(
                             colors[block, n, c] = np.uint8(was + share * (np.float32(rgb[v, u, c]) - was) + 0.5)
                     label = segments[v, u]
                     if label > 0:
-                        if labels[block, n] == label:
+                        if same[labels[block, n]] == same[label]:
                             support[block, n] = min(np.int16(support[block, n] + 1), most_support)
                         elif support[block, n] > 0:
                             support[block, n] -= np.int16(1)
