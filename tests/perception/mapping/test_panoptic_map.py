@@ -20,7 +20,13 @@ from simtrack.perception.mapping.panoptic.counts import (
     SegmentEntity,
     SeparateCounts,
 )
-from simtrack.perception.mapping.panoptic.entities import EntityConfig, MapEntityMesh, _least_observed, extract_surface
+from simtrack.perception.mapping.panoptic.entities import (
+    EntityConfig,
+    MapEntityMesh,
+    _least_observed,
+    _lower_bound,
+    extract_surface,
+)
 from simtrack.perception.mapping.panoptic.files import read_entities, write_entities
 from simtrack.perception.mapping.panoptic.frame_segments import SILENT, FrameFusionConfig, fuse_segments
 from simtrack.perception.mapping.panoptic.layout import split_layout
@@ -79,7 +85,7 @@ def test_every_entity_is_one_mesh_of_its_class(mapped: PanopticMap) -> None:
     assert set(entities) == {"floor1", "box1"}
     np.testing.assert_allclose(entities["box1"].mesh.extents, (0.5, 0.4, 0.3), atol=2.5 * VOXEL)
     colors = entities["box1"].mesh.face_colors
-    assert colors is not None and np.median(colors[:, 0]) > 150 and entities["box1"].score == 1.0
+    assert colors is not None and np.median(colors[:, 0]) > 150
 
 
 def test_the_map_does_not_depend_on_the_number_of_threads() -> None:
@@ -281,6 +287,14 @@ def test_segments_of_one_entity_and_what_was_merged_support_each_other_in_a_voxe
         volume.integrate(frame.depth, None, 2 * label, CAMERA, T, alike)
         held = volume.support[: volume.count][volume.labels[: volume.count] == 1]
         assert len(held) > 1000 and (held == support).all()
+
+
+def test_scores_rise_with_what_agrees_and_with_how_much_there_is() -> None:
+    scores = [_lower_bound(3, 3), _lower_bound(12, 12), _lower_bound(48, 48)]
+    assert scores == sorted(scores) and scores[2] > 0.9 and _lower_bound(0, 7) == pytest.approx(0.0, abs=1e-12)
+    # The bound solves (share - bound)^2 = z^2 bound (1 - bound) / n.
+    bound = _lower_bound(9, 12)
+    assert (0.75 - bound) ** 2 == pytest.approx(1.96**2 * bound * (1.0 - bound) / 12) and bound < 0.75
 
 
 def test_the_doubt_that_things_are_held_in_follows_from_how_often_observations_disagree() -> None:

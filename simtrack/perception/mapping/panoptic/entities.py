@@ -71,7 +71,8 @@ class MapEntityMesh:
     instance: int
     """Global instance p."""
     score: float
-    """0 to 1: share of the observations of its segments that say that they are this."""
+    """0 to 1: share of the observations of its best founded segment that say that it is this; the lower bound of that
+    share (Wilson's, at 97.5 %), since few observations are easily of one mind."""
     mesh: Mesh
     """Map frame, faces coloured."""
 
@@ -165,8 +166,8 @@ def extract_entities(
             mesh = _large_pieces(mesh, config.gap, config.least_piece)
         if len(mesh.faces) and face_areas(mesh).sum() >= config.least_area:
             running[name] = running.get(name, 0) + 1
-            agreeing, observed = sum(e.agreeing for e in parts[name, p]), sum(e.observed for e in parts[name, p])
-            found.append(MapEntityMesh(f"{name}{running[name]}", name, p, agreeing / observed, mesh))
+            score = max(_lower_bound(each.agreeing, each.observed) for each in parts[name, p])
+            found.append(MapEntityMesh(f"{name}{running[name]}", name, p, score, mesh))
     return tuple(found)
 
 
@@ -178,6 +179,13 @@ def _least_observed(entities: Mapping[int, SegmentEntity], config: EntityConfig)
     if config.doubt <= 0.0:
         return config.least_observed
     return int(np.clip(np.ceil(np.log(config.doubt) / np.log(wrong)), 1, config.least_observed))
+
+
+def _lower_bound(agreeing: int, observed: int, z: float = 1.96) -> float:
+    """Wilson's lower bound of a share (JASA 22, 1927), of which the true one is above at z standard deviations."""
+    share, spread = agreeing / observed, z * z / observed
+    root = np.sqrt(spread * (share * (1.0 - share) + 0.25 * spread))
+    return float((share + 0.5 * spread - root) / (1.0 + spread))
 
 
 def _part(surface: Surface, chosen: np.ndarray) -> Mesh:
