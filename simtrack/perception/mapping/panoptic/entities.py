@@ -36,7 +36,7 @@ class EntityConfig:
     doubt: float = 0.05
     """... unless fewer are enough for this chance that all are wrong, each as often as observations disagree with what
     their segments are taken for."""
-    least_area: float = 0.002
+    least_area: float = 0.006
     """Square metres; smaller entities are dropped."""
     gap: float = 0.06
     """Metres between pieces of a thing that hang together."""
