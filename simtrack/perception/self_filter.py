@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, LidarScan, RgbdFrame
+from simtrack.contracts import Bool, Float32, Float64, LidarScan, RgbdFrame
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
@@ -85,7 +85,6 @@ class SelfFilter:
         self._reach = {
             link.name: float(np.linalg.norm(link.vertices, axis=1).max()) for link in robot.links if len(link.faces)
         }
-        self._bundles: dict[tuple[CameraIntrinsics, int], RayBundle] = {}
         self._turn: _Turn | None = None
         self._placed: dict[str, Float64] = {}
         self._posture: tuple[tuple[str, float], ...] | None = None
@@ -128,10 +127,7 @@ class SelfFilter:
     def _coarse_depth(self, frame: RgbdFrame, positions: Mapping[str, float]) -> Float32:
         """Depth of the body in every `stride`-th pixel, metres, inf where none is seen."""
         self._place(positions)
-        key = (frame.intrinsics, self.config.stride)
-        if key not in self._bundles:
-            self._bundles[key] = RayBundle.from_camera(frame.intrinsics, stride=self.config.stride)
-        bundle = self._bundles[key]
+        bundle = RayBundle.from_camera(frame.intrinsics, stride=self.config.stride)
         depth = self._scene.cast(bundle, frame.T_base_camera, max_distance=3.0, min_distance=0.05).distances
         return depth.reshape(bundle.shape)
 

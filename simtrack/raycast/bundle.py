@@ -57,11 +57,7 @@ class RayBundle:
         """
         if stride < 1:
             raise InvalidValueError("stride", stride, ">= 1")
-        u0, v0, u1, v1 = _clip(window, intrinsics)
-        columns = np.arange(-(-u0 // stride) * stride, u1, stride, dtype=np.int32)
-        rows = np.arange(-(-v0 // stride) * stride, v1, stride, dtype=np.int32)
-        pixels = (rows[:, None] * intrinsics.width + columns).ravel()
-        return _from_pixels(intrinsics, pixels, stride, (len(rows), len(columns)))
+        return _grid(intrinsics, stride, _clip(window, intrinsics), packet_width())
 
     @staticmethod
     def from_pixels(intrinsics: CameraIntrinsics, pixels: npt.ArrayLike) -> "RayBundle":
@@ -78,7 +74,7 @@ class RayBundle:
         count = intrinsics.width * intrinsics.height
         if flat.size and not (flat.min() >= 0 and flat.max() < count):
             raise InvalidValueError("pixels", (int(flat.min()), int(flat.max())), f"flat indices 0..{count - 1}")
-        return _from_pixels(intrinsics, flat, 1, (len(flat),))
+        return _from_pixels(intrinsics, flat, 1, (len(flat),), packet_width())
 
     @staticmethod
     def from_windows(
@@ -160,6 +156,16 @@ def _group_starts(labels: np.ndarray) -> np.ndarray:
     return np.cumsum(counts)[:-1]
 
 
+@lru_cache(maxsize=8)
+def _grid(intrinsics: CameraIntrinsics, stride: int, window: tuple[int, int, int, int], width: int) -> RayBundle:
+    """Rays of a window of the image in packets of `width`: a camera's are the same for every image."""
+    u0, v0, u1, v1 = window
+    columns = np.arange(-(-u0 // stride) * stride, u1, stride, dtype=np.int32)
+    rows = np.arange(-(-v0 // stride) * stride, v1, stride, dtype=np.int32)
+    pixels = (rows[:, None] * intrinsics.width + columns).ravel()
+    return _from_pixels(intrinsics, pixels, stride, (len(rows), len(columns)), width)
+
+
 def _clip(window: tuple[int, int, int, int] | None, intrinsics: CameraIntrinsics) -> tuple[int, int, int, int]:
     u0, v0, u1, v1 = (0, 0, intrinsics.width, intrinsics.height) if window is None else (int(x) for x in window)
     return max(u0, 0), max(v0, 0), min(u1, intrinsics.width), min(v1, intrinsics.height)
@@ -181,10 +187,12 @@ def _spread_bits(value: np.ndarray) -> npt.NDArray[np.int64]:
     return out
 
 
-def _from_pixels(intrinsics: CameraIntrinsics, pixels: Int32, stride: int, shape: tuple[int, ...]) -> RayBundle:
+def _from_pixels(
+    intrinsics: CameraIntrinsics, pixels: Int32, stride: int, shape: tuple[int, ...], width: int
+) -> RayBundle:
     columns, rows = _camera_tables(intrinsics, stride)
     camera = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
-    directions, order, packed = _pack_pixels(pixels, intrinsics.width, columns, rows, *camera, packet_width())
+    directions, order, packed = _pack_pixels(pixels, intrinsics.width, columns, rows, *camera, width)
     return RayBundle(directions, order, packed, pixels, shape, _pixel_cones(packed))
 
 

@@ -97,11 +97,17 @@ class InstanceTable:
         keys = np.concatenate(list(motions.values()))
         linear, owners = keys[:, :3, :3], np.repeat(numbers, counts)
         centres = (linear @ self.spheres[owners, :3, None])[:, :, 0] + keys[:, :3, 3]
-        reach = self.spheres[owners, 3] * np.linalg.norm(linear, ord=2, axis=(1, 2))
+        reach = self.spheres[owners, 3] * _largest_stretch(linear)
         way = np.linalg.norm(centres - np.repeat(centres[first], counts, axis=0), axis=1)
         self.rows[numbers, 9:12] = centres[first]
         self.rows[numbers, 12] = np.maximum.reduceat(reach + way, first)
         self.keys = linear.astype(np.float32)
+
+
+def _largest_stretch(linear: Float64) -> Float64:
+    """(K,) upper bounds of the spectral norms of matrices (K, 3, 3); those of rotations and scalings themselves."""
+    gram = np.abs(linear.transpose(0, 2, 1) @ linear)
+    return np.asarray(np.sqrt(gram.sum(axis=1).max(axis=1)))
 
 
 def checked_pose(T: npt.ArrayLike, name: str) -> Float64:
