@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import numpy.typing as npt
 
-from simtrack.contracts import NANOSECONDS, Bool, CameraIntrinsics, Float64, Int32
+from simtrack.contracts import NANOSECONDS, Bool, CameraIntrinsics, Float32, Float64, Int32
 from simtrack.errors import UnknownNameError
 from simtrack.geometry.transforms import difference, inverse
-from simtrack.raycast import RayBundle, RayScene, TriangleMesh
+from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh
 from simtrack.simulation.contacts import SUPPORTING, contact_pairs
 from simtrack.simulation.history import History
 from simtrack.simulation.placement import DEEP
+from simtrack.simulation.rendering import NEAR
 from simtrack.simulation.silhouettes import silhouette_rays
 from simtrack.simulation.world import SENSOR_BODIES, World, body_pose, body_poses
 from simtrack.simulation.world_rays import WorldRays
@@ -92,6 +93,8 @@ class GroundTruth:
         self._corners = np.array([model.keypoints[:8] for model in world.objects.values()]).reshape(-1, 8, 3)
         self._object_ids = np.array([world.names.index(name) for name in world.objects], np.int32)
         self._lidar: dict[int, Int32] = {}
+        self._images: dict[int, RayHits] = {}
+        """What the pixels of the last images met, where rays rendered them."""
         self._full: RayBundle | None = None
         self._seen: tuple[int, dict[str, Visibility]] | None = None
         """The last answer of `visibility`: detector and evaluation ask about the same images."""
@@ -157,27 +160,51 @@ class GroundTruth:
         return dict(self._seen[1])
 
     def _look(self, stamp: int) -> dict[str, Visibility]:
-        self._load(stamp)
+        self._history.load(stamp, self._scratch)
         T_map_camera = body_pose(self._scratch, self._sensors["camera"])
         names, poses = self._object_poses()
-        owners, rays, inside, area = silhouette_rays(self._corners, inverse(T_map_camera) @ poses, self._intrinsics)
+        T_camera_object = inverse(T_map_camera) @ poses
+        owners, rays, pixels, area = silhouette_rays(self._corners, T_camera_object, self._intrinsics)
         if not len(rays):
             return dict.fromkeys(names, Visibility(0, 0.0))
         directions = rays @ T_map_camera[:3, :3].T.astype(np.float32)
         # Each object alone: they stand far apart from one another, and each ray starts in front of its own.
         alone, offsets = self._objects_apart(names, poses, np.flatnonzero(area))
-        own = alone.cast_rays(T_map_camera[:3, 3] + offsets[owners], directions).instances == owners
+
+        def meets(chosen: Bool) -> Bool:
+            starts = T_map_camera[:3, 3] + offsets[owners[chosen]]
+            return alone.cast_rays(starts, directions[chosen]).instances == owners[chosen]
+
+        own, seen = np.zeros(len(rays), np.bool_), np.zeros(len(rays), np.bool_)
+        if stamp in self._images:
+            inside = np.flatnonzero(pixels >= 0)
+            ids, depth = self._rendered(stamp, pixels[inside])
+            seen[inside] = own[inside] = ids == self._object_ids[owners[inside]]
+            # What lies behind all of an object does not hide it: such rays pass it by.
+            farthest = (self._corners @ T_camera_object[:, 2, :3, None])[:, :, 0].max(axis=1) + T_camera_object[:, 2, 3]
+            passing = np.zeros(len(rays), np.bool_)
+            passing[inside] = depth > farthest[owners[inside]]
+            left = ~own & ~passing
+            own[left] = meets(left)
+        else:
+            self._rays.place(self._scratch)
+            own = meets(np.ones(len(rays), np.bool_))
+            chosen = own & (pixels >= 0)
+            origins = np.broadcast_to(T_map_camera[:3, 3], (int(chosen.sum()), 3))
+            hits = self._rays.scene.cast_rays(origins, directions[chosen], min_distance=NEAR)
+            seen[chosen] = self._rays.ids(hits) == self._object_ids[owners[chosen]]
         whole = np.bincount(owners[own], minlength=len(names)).tolist()
-        own &= inside
-        owners, directions = owners[own], directions[own]
-        origins = np.broadcast_to(T_map_camera[:3, 3], directions.shape)
-        hits = self._rays.scene.cast_rays(origins, directions, min_distance=0.03)
-        seen = self._rays.ids(hits) == self._object_ids[owners]
         visible = np.bincount(owners[seen], minlength=len(names)).tolist()
         return {
             name: Visibility(round(visible[k] * float(area[k])), visible[k] / max(whole[k], 1))
             for k, name in enumerate(names)
         }
+
+    def _rendered(self, stamp: int, pixels: Int32) -> tuple[Int32, Float32]:
+        """Index into `names`, -1 = nothing, and depth, inf = nothing, of pixels of an image that is kept."""
+        image = self._images[stamp]
+        met = RayHits(image.distances[pixels], image.normals[:0], image.faces[pixels], image.instances[pixels])
+        return self._rays.ids(met), met.distances
 
     def ids(self, stamp: int) -> Int32:
         """(H, W), index into `names` of what each pixel of the camera sees, -1 = nothing."""
@@ -185,7 +212,7 @@ class GroundTruth:
         if self._full is None:
             self._full = RayBundle.from_camera(self._intrinsics)
         T_map_camera = body_pose(self._scratch, self._sensors["camera"])
-        hits = self._rays.scene.cast(self._full, T_map_camera, min_distance=0.03)
+        hits = self._rays.scene.cast(self._full, T_map_camera, min_distance=NEAR)
         return self._rays.ids(hits).reshape(self._intrinsics.height, self._intrinsics.width)
 
     def rays(self, stamp: int) -> WorldRays:
@@ -214,9 +241,16 @@ class GroundTruth:
         while len(self._lidar) > keep:
             del self._lidar[min(self._lidar)]
 
+    def record_image(self, stamp: int, hits: RayHits, keep: int = 4) -> None:
+        """Keep what the pixels of an image met that rays rendered, of the last `keep` images."""
+        self._images[stamp] = RayHits(hits.distances.copy(), hits.normals[:0], hits.faces.copy(), hits.instances.copy())
+        while len(self._images) > keep:
+            del self._images[min(self._images)]
+
     def clear(self) -> None:
         """Forget what was, as the history does: the clock begins anew."""
         self._contacts.clear()
+        self._images.clear()
         self._lidar.clear()
         self._seen = None
 

@@ -272,6 +272,11 @@ class EmbreeRenderer:
         hits, T_map_camera = self._cast(data)
         return shaded(self._rays, self._bundle, T_map_camera, self._shape, hits)
 
+    @property
+    def hits(self) -> RayHits:
+        """What the pixels of the last image met, at any distance; overwritten by the next one."""
+        return self._hits
+
     def _cast(self, data: "mujoco.MjData") -> tuple[RayHits, Float64]:
         """What the pixels meet, at any distance, and the camera's pose; images of one moment share one cast."""
         T_map_camera = transform(data.xmat[self._body].reshape(3, 3), data.xpos[self._body])

@@ -3,14 +3,16 @@
 import numpy as np
 from numba import njit
 
-from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, Int32
+from simtrack.contracts import CameraIntrinsics, Float32, Float64, Int32
 from simtrack.geometry.projection import bounding_rectangle
 
 RAYS = 900
 """About how many rays cover the box of one object's silhouette."""
 
 
-def silhouette_rays(corners: Float64, poses: Float64, camera: CameraIntrinsics) -> tuple[Int32, Float32, Bool, Float64]:
+def silhouette_rays(
+    corners: Float64, poses: Float64, camera: CameraIntrinsics
+) -> tuple[Int32, Float32, Int32, Float64]:
     """Rays over the projected boxes of the objects that may be seen in an image, on its pixel grid.
 
     What lies beside the image, or reaches behind the camera, has none.
@@ -21,15 +23,15 @@ def silhouette_rays(corners: Float64, poses: Float64, camera: CameraIntrinsics) 
         camera: intrinsics.
 
     Returns:
-        Of each ray (R,) the object, its direction (R, 3), camera frame, z = 1, and whether it goes through the image;
-        and the pixels (K,) that a ray of each object stands for.
+        Of each ray (R,) the object, its direction (R, 3), camera frame, z = 1, and the flat index of the pixel whose
+        centre it goes through, -1 outside of the image; and the pixels (K,) that a ray of each object stands for.
     """
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     boxes = np.zeros((len(corners), 5), np.int64)
     count = _boxes(corners, poses, intrinsics, camera.width, camera.height, boxes)
-    owners, rays, inside = np.empty(count, np.int32), np.empty((count, 3), np.float32), np.empty(count, np.bool_)
-    _fill(boxes, intrinsics, camera.width, camera.height, owners, rays, inside)
-    return owners, rays, inside, boxes[:, 4].astype(float) ** 2
+    owners, rays, pixels = np.empty(count, np.int32), np.empty((count, 3), np.float32), np.empty(count, np.int32)
+    _fill(boxes, intrinsics, camera.width, camera.height, owners, rays, pixels)
+    return owners, rays, pixels, boxes[:, 4].astype(float) ** 2
 
 
 @njit(cache=True, nogil=True)
@@ -50,7 +52,7 @@ def _boxes(corners, poses, camera, width, height, boxes):
 
 
 @njit(cache=True, nogil=True)
-def _fill(boxes, camera, width, height, owners, rays, inside):
+def _fill(boxes, camera, width, height, owners, rays, pixels):
     found = 0
     for k in range(boxes.shape[0]):
         for row in range(boxes[k, 3]):
@@ -60,5 +62,5 @@ def _fill(boxes, camera, width, height, owners, rays, inside):
                 owners[found] = k
                 rays[found, 0], rays[found, 1] = (u - camera[2]) / camera[0], (v - camera[3]) / camera[1]
                 rays[found, 2] = 1.0
-                inside[found] = 0 <= u < width and 0 <= v < height
+                pixels[found] = v * width + u if 0 <= u < width and 0 <= v < height else -1
                 found += 1

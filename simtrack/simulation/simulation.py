@@ -34,7 +34,7 @@ from simtrack.simulation.ground_truth import GroundTruth
 from simtrack.simulation.hand_script import HandDirector
 from simtrack.simulation.history import KEY_NS, History
 from simtrack.simulation.randomness import stream
-from simtrack.simulation.rendering import make_renderer
+from simtrack.simulation.rendering import EmbreeRenderer, make_renderer
 from simtrack.simulation.scene_file import SceneFile
 from simtrack.simulation.settling import rearrange
 from simtrack.simulation.world import SENSOR_BODIES, TIMESTEP_NS, build_world, configured
@@ -358,6 +358,8 @@ class Simulation:
 
         self._history.load(stamp, self._scratch)
         exact = self._renderer.depth(self._scratch)
+        if isinstance(self._renderer, EmbreeRenderer):
+            self.truth.record_image(stamp, self._renderer.hits)
         draws = self._draws.result()
         depth = apply_depth_noise(exact, None, self.camera.intrinsics, self.depth_noise, self._rng_depth, draws=draws)
         rgb = self._renderer.rgb(self._scratch) if want_rgb else None

@@ -14,10 +14,11 @@ def _rays(*positions: tuple[float, float, float]):
 
 
 def test_rays_cover_the_projected_box_on_the_pixel_grid() -> None:
-    owners, rays, inside, area = _rays((0.0, 0.0, 1.0))
+    owners, rays, flat, area = _rays((0.0, 0.0, 1.0))
     pixels = rays[:, :2] * 150.0 + (79.5, 59.5)
     stride = round(float(np.sqrt(area[0])))
-    assert inside.all() and (owners == 0).all()
+    assert (owners == 0).all()
+    np.testing.assert_array_equal(flat, pixels.round() @ (1, CAMERA.width))
     np.testing.assert_allclose(pixels, pixels.round(), atol=1e-4)
     half = 150.0 * 0.1 / 0.9  # of the nearer side
     assert pixels[:, 0].min() <= 79.5 - half and pixels[:, 0].max() >= 79.5 + half - stride
@@ -32,7 +33,7 @@ def test_large_silhouettes_are_sampled_more_coarsely() -> None:
 
 
 def test_what_lies_beside_the_image_or_behind_the_camera_has_no_rays() -> None:
-    owners, _, inside, area = _rays((5.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.53, 0.0, 1.0), (0.0, -3.0, 1.0))
+    owners, _, flat, area = _rays((5.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.53, 0.0, 1.0), (0.0, -3.0, 1.0))
     assert set(owners.tolist()) == {2}
-    assert inside.any() and not inside.all()  # half of it is in the image
+    assert (flat >= 0).any() and (flat == -1).any()  # half of it is in the image
     assert np.flatnonzero(area).tolist() == [2]

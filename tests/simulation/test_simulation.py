@@ -179,6 +179,23 @@ def test_visibility_agrees_with_the_id_image(resting: Simulation) -> None:
     assert seen["relay"].fraction > 0.9
 
 
+def test_a_rendered_image_tells_what_is_visible_as_rays_of_its_own_do(small_scene: MakeScene) -> None:
+    """The image of a stamp is looked up instead of being cast again; the two agree up to rays along an edge."""
+    with Simulation(small_scene(), seed=3, renderer="embree") as simulation:
+        for pan in (0.3, 0.0, -0.5, -1.2):
+            for _ in range(6):
+                simulation.advance(Command(head_pan=pan, head_tilt=-0.3, torso=0.3))
+            truth = simulation.truth
+            looked_up = truth.visibility(simulation.now)
+            truth._images.clear()
+            truth._seen = None
+            cast = truth.visibility(simulation.now)
+            for name, seen in cast.items():
+                assert looked_up[name].fraction == pytest.approx(seen.fraction, abs=0.01)
+                assert looked_up[name].pixels == pytest.approx(seen.pixels, rel=0.01, abs=20)
+            assert any(seen.fraction > 0.0 for seen in cast.values())
+
+
 def test_an_object_leaving_the_image_loses_visibility(small_scene: MakeScene, monkeypatch: pytest.MonkeyPatch) -> None:
     with Simulation(small_scene(), seed=3, renderer="embree") as simulation:
         close_eyes(simulation, monkeypatch)
