@@ -16,6 +16,9 @@ from simtrack.geometry.transforms import transform_planar
 from simtrack.perception.localization.config import SearchConfig
 from simtrack.perception.localization.measurement import Measurement
 
+MIN_RANGE = 0.3
+"""m from the robot's centre: nearer points are left out."""
+
 
 @dataclass(frozen=True, slots=True)
 class SearchMap:
@@ -33,6 +36,10 @@ class SearchMap:
     """(K, 3) int64: L, X, Y of each level."""
     offsets: np.ndarray
     """(K,) int64: where each level starts in `pyramid`."""
+    planes: np.ndarray
+    """The levels that the first cells are looked up at, see `search_kernels.combed`."""
+    first: int
+    """The finest of them."""
     free: np.ndarray
     """(X, Y) bool: a robot's centre may be there."""
     floor: float
@@ -53,7 +60,7 @@ def build_search_map(static_map: StaticMap, config: SearchConfig, floor: float =
     """Slice the map's mesh into likelihood fields."""
     from scipy.ndimage import distance_transform_edt
 
-    from simtrack.perception.localization.search_kernels import pyramid_level, rasterise
+    from simtrack.perception.localization.search_kernels import combed, level_for, pyramid_level, rasterise
 
     margin = 1.0
     vertices = np.asarray(static_map.vertices, dtype=np.float64)
@@ -76,7 +83,12 @@ def build_search_map(static_map: StaticMap, config: SearchConfig, floor: float =
     offsets = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:-1]])
     pyramid = np.concatenate([field.ravel() for field in fields])
     free = level & (nearest > config.clearance)
-    return SearchMap(origin, config.resolution, pyramid, shapes, offsets, free, floor)
+    first, last = (
+        level_for(0.5 * (config.coarse_cell + config.coarse_yaw * radius), config.resolution, len(fields) - 1)
+        for radius in (MIN_RANGE, config.max_range)
+    )
+    planes = combed(pyramid, shapes, offsets, first, last, max(1, round(config.coarse_cell / config.resolution)))
+    return SearchMap(origin, config.resolution, pyramid, shapes, offsets, planes, first, free, floor)
 
 
 def search_points(measurement: Measurement, config: SearchConfig) -> tuple[Float64, np.ndarray]:
@@ -87,7 +99,7 @@ def search_points(measurement: Measurement, config: SearchConfig) -> tuple[Float
     points = measurement.points
     layer = np.searchsorted(np.array(config.heights), points[:, 2]) - 1
     radius = np.hypot(points[:, 0], points[:, 1])
-    good = (layer >= 0) & (layer < len(config.heights) - 1) & (radius < config.max_range) & (radius > 0.3)
+    good = (layer >= 0) & (layer < len(config.heights) - 1) & (radius < config.max_range) & (radius > MIN_RANGE)
     points, layer = points[good, :2], layer[good]
     cells = np.floor(points / (1.5 * config.resolution)).astype(np.int64) + (1 << 20)
     keys = (layer << 50) | (cells[:, 0] << 25) | cells[:, 1]
@@ -117,12 +129,14 @@ def search(
         return empty
     order = np.argsort(np.arange(len(points)) * 0.6180339887498949 % 1.0)  # any first part is evenly spread
     points, layers = points[order], layers[order]
-    cell, step = config.coarse_cell, config.coarse_yaw
-    cells = _coarse_cells(search_map, config, window)
+    cells = _coarse_cells(points, layers, search_map, config, window)
     if not len(cells):
         return empty
-    score, stacked = np.zeros(0), (search_map.pyramid, search_map.shapes, search_map.offsets)
-    for level in range(config.levels):
+    cell, step = config.coarse_cell, config.coarse_yaw
+    score, stacked = np.zeros(len(cells)), (search_map.pyramid, search_map.shapes, search_map.offsets)
+    for level in range(1, config.levels):
+        cells = expand_cells(cells, cell, step)
+        cell, step = cell / 2, step / 2
         count = min(config.points[level], len(points))
         last = level == config.levels - 1
         arguments = points[:count], layers[:count], search_map.origin, search_map.resolution
@@ -132,31 +146,59 @@ def search(
         keep = np.flatnonzero(score >= config.keep * score.max())
         if len(keep) > config.beam[level]:
             keep = keep[np.argpartition(-score[keep], config.beam[level])[: config.beam[level]]]
-        cells = expand_cells(cells[np.sort(keep)], cell, step)
-        cell, step = cell / 2, step / 2
+        cells = cells[np.sort(keep)]
     return _distinct(cells, score, search_map, config)
 
 
-def _coarse_cells(search_map: SearchMap, config: SearchConfig, window: tuple[Float64, float, float] | None) -> Float64:
-    """(C, 3) x, y, yaw of the centres of the first cells."""
-    block = max(1, round(config.coarse_cell / search_map.resolution))
+def _coarse_cells(
+    points: Float64,
+    layers: np.ndarray,
+    search_map: SearchMap,
+    config: SearchConfig,
+    window: tuple[Float64, float, float] | None,
+) -> Float64:
+    """(C, 3) x, y, yaw of the centres of the first cells that are gone on with."""
+    from simtrack.perception.localization.search_kernels import grid_totals
+
+    resolution, cell, step = search_map.resolution, config.coarse_cell, config.coarse_yaw
+    comb = search_map.planes.shape[2]
     free = search_map.free
-    padded = np.zeros([-(-n // block) * block for n in free.shape], bool)
+    padded = np.zeros([-(-n // comb) * comb for n in free.shape], bool)
     padded[: free.shape[0], : free.shape[1]] = free
-    any_free = padded.reshape(padded.shape[0] // block, block, -1, block).any(axis=(1, 3))
-    positions = (np.argwhere(any_free) + 0.5) * block * search_map.resolution + search_map.origin
-    turns = int(np.ceil(2 * np.pi / config.coarse_yaw))
-    yaws = np.arange(turns) * config.coarse_yaw
+    wanted = padded.reshape(padded.shape[0] // comb, comb, -1, comb).any(axis=(1, 3))
+    centres = [
+        (np.arange(n) + 0.5) * comb * resolution + low for n, low in zip(wanted.shape, search_map.origin, strict=True)
+    ]
+    yaws = np.arange(int(np.ceil(2 * np.pi / step))) * step
     if window is not None:
         T, half, half_yaw = window
-        positions = positions[(np.abs(positions - T[:2, 3]) <= half + config.coarse_cell / 2).all(axis=1)]
-        yaw = np.arctan2(T[1, 0], T[0, 0])
-        turns = int(np.ceil(half_yaw / config.coarse_yaw))
-        yaws = yaw + np.arange(-turns, turns + 1) * config.coarse_yaw
-    cells = np.empty((len(positions), len(yaws), 3))
-    cells[:, :, :2] = positions[:, None, :]
-    cells[:, :, 2] = yaws
-    return cells.reshape(-1, 3)
+        near = [np.abs(c - at) <= half + cell / 2 for c, at in zip(centres, T[:2, 3], strict=True)]
+        wanted &= near[0][:, None] & near[1]
+        turns = int(np.ceil(half_yaw / step))
+        yaws = np.arctan2(T[1, 0], T[0, 0]) + np.arange(-turns, turns + 1) * step
+    if not wanted.any():
+        return np.zeros((0, 3))
+    sides = [np.flatnonzero(wanted.any(axis=1 - axis)) for axis in (0, 1)]
+    low = np.array([side[0] for side in sides])
+    shape = np.array([side[-1] + 1 for side in sides]) - low
+    points, layers = points[: config.points[0]], layers[: config.points[0]]
+    totals = grid_totals(search_map.planes, search_map.first, points, layers, yaws, resolution, cell, step, low, shape)
+    columns, rows = np.nonzero(wanted[low[0] : low[0] + shape[0], low[1] : low[1] + shape[1]])
+    score = totals[:, columns, rows]
+    kept = _best(score.ravel(), config.keep, config.beam[0])
+    turn, place = kept // len(columns), kept % len(columns)
+    return np.stack([centres[0][columns[place] + low[0]], centres[1][rows[place] + low[1]], yaws[turn]], axis=1)
+
+
+def _best(totals: np.ndarray, share: float, count: int) -> np.ndarray:
+    """Ascending indices of the whole numbers (N,) that are no less than a `share` of the largest, `count` at most."""
+    least = int(np.ceil(share * int(totals.max())))
+    above = np.cumsum(np.bincount(totals)[::-1])[::-1]  # how many are no less than each number
+    enough = int(np.searchsorted(-above, -count))  # the least number that no more than `count` reach
+    if enough <= least:
+        return np.flatnonzero(totals >= least)
+    equal = np.flatnonzero(totals == enough - 1)[: count - int(above[enough]) if enough < len(above) else count]
+    return np.sort(np.concatenate([np.flatnonzero(totals >= enough), equal]))
 
 
 def _distinct(cells: Float64, score: Float64, search_map: SearchMap, config: SearchConfig) -> SearchResult:

@@ -5,6 +5,9 @@ import numpy as np
 
 from simtrack.contracts import Float64
 
+_CHUNK = 512
+"""Pose cells a thread takes at a time."""
+
 
 @nb.njit(cache=True, nogil=True)
 def rasterise(
@@ -70,6 +73,91 @@ def pyramid_level(fine: np.ndarray, block: int) -> np.ndarray:
     return out
 
 
+@nb.njit(cache=True, nogil=True)
+def level_for(move: float, resolution: float, top: int) -> int:
+    """Finest level, `top` at most, whose neighbourhood covers a movement in metres."""
+    level = 0
+    while level < top and move > (0.0 if level == 0 else resolution * 2.0 ** (level - 1)):
+        level += 1
+    return level
+
+
+@nb.njit(cache=True, nogil=True)
+def combed(
+    pyramid: np.ndarray, shapes: np.ndarray, offsets: np.ndarray, first: int, last: int, comb: int
+) -> np.ndarray:
+    """(K, L, comb, comb, X / comb, Y / comb) uint8: levels `first` to `last` of a pyramid in the cells of level 0.
+
+    Every `comb`-th cell of a row lies side by side: what a point meets as the pose moves by that many cells.
+    """
+    layers, last_shift = shapes[0, 0], max(last - 1, 0)
+    w = ((shapes[last, 1] << last_shift) + comb - 1) // comb
+    h = ((shapes[last, 2] << last_shift) + comb - 1) // comb
+    out = np.zeros((last - first + 1, layers, comb, comb, w, h), np.uint8)
+    for level in range(first, last + 1):
+        shift, wide, high = max(level - 1, 0), shapes[level, 1], shapes[level, 2]
+        for k in range(layers):
+            for x in range(wide << shift):
+                row = offsets[level] + (k * wide + (x >> shift)) * high
+                for y in range(high << shift):
+                    out[level - first, k, x % comb, y % comb, x // comb, y // comb] = pyramid[row + (y >> shift)]
+    return out
+
+
+@nb.njit(cache=True, nogil=True, parallel=True)
+def grid_totals(
+    planes: np.ndarray,
+    first: int,
+    points: Float64,
+    layers: np.ndarray,
+    yaws: Float64,
+    resolution: float,
+    cell: float,
+    step: float,
+    low: np.ndarray,
+    shape: np.ndarray,
+) -> np.ndarray:
+    """(A, W, H) int32, sums of the points' likelihoods in 255ths, for all pose cells of a grid: upper bounds.
+
+    As `bound_cells`, for cells of side ``comb * resolution`` that fill a rectangle of the map: whole rows at once.
+
+    Args:
+        planes: from `combed`, of levels from `first` on.
+        first: see there.
+        points: (N, 2), base frame, metres.
+        layers: (N,).
+        yaws: (A,), radians.
+        resolution: metres.
+        cell: side of the cells for the bound, metres, and `step` in yaw, radians.
+        step: see there.
+        low: (2,) cell of the rectangle's corner.
+        shape: (2,) cells of the rectangle, W and H.
+
+    """
+    comb, top, count = planes.shape[2], first + planes.shape[0] - 1, points.shape[0]
+    out = np.zeros((yaws.shape[0], shape[0], shape[1]), np.int32)
+    for a in nb.prange(yaws.shape[0]):
+        cosine, sine = np.cos(yaws[a]), np.sin(yaws[a])
+        at = np.empty((count, 5), np.int64)
+        for i in range(count):
+            radius = np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
+            at[i, 0] = level_for(0.5 * cell + 0.5 * step * radius, resolution, top) - first
+            x = int(np.floor(0.5 * comb + (cosine * points[i, 0] - sine * points[i, 1]) / resolution))
+            y = int(np.floor(0.5 * comb + (sine * points[i, 0] + cosine * points[i, 1]) / resolution))
+            at[i, 1], at[i, 2], at[i, 3], at[i, 4] = x % comb, y % comb, x // comb + low[0], y // comb + low[1]
+        for column in range(shape[0]):
+            target = out[a, column]
+            for i in range(count):
+                x, start = at[i, 3] + column, at[i, 4]
+                under, over = max(0, -start), min(shape[1], planes.shape[5] - start)
+                if 0 <= x < planes.shape[4] and under < over:
+                    source = planes[at[i, 0], layers[i], at[i, 1], at[i, 2], x, under + start : over + start]
+                    within = target[under:over]
+                    for k in range(over - under):
+                        within[k] += source[k]
+    return out
+
+
 @nb.njit(cache=True, nogil=True, parallel=True)
 def bound_cells(
     cells: Float64,
@@ -96,22 +184,26 @@ def bound_cells(
     for i in range(count):
         radius = np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
         move = 0.5 * cell + 0.5 * step * radius if bounded else 0.0
-        level = 0
-        while level < top and move > (0.0 if level == 0 else resolution * 2.0 ** (level - 1)):
-            level += 1
+        level = level_for(move, resolution, top)
         scale[i] = 1.0 / (resolution * (1.0 if level == 0 else 2.0 ** (level - 1)))
         width[i], height[i] = shapes[level, 1], shapes[level, 2]
         offset[i] = offsets[level] + layers[i] * width[i] * height[i]
-    for c in nb.prange(cells.shape[0]):
-        cosine, sine = np.cos(cells[c, 2]), np.sin(cells[c, 2])
-        x0, y0 = cells[c, 0] - origin[0], cells[c, 1] - origin[1]
-        total = 0
-        for i in range(count):
-            x = (x0 + cosine * points[i, 0] - sine * points[i, 1]) * scale[i]
-            y = (y0 + sine * points[i, 0] + cosine * points[i, 1]) * scale[i]
-            if 0.0 <= x < width[i] and 0.0 <= y < height[i]:
-                total += field[offset[i] + int(x) * height[i] + int(y)]
-        out[c] = total / (255.0 * count)
+    for chunk in nb.prange((cells.shape[0] + _CHUNK - 1) // _CHUNK):
+        turned, yaw = np.empty((count, 2)), np.nan
+        for c in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, cells.shape[0])):
+            if cells[c, 2] != yaw:  # halves of a cell come with the same yaw in a row
+                yaw = cells[c, 2]
+                cosine, sine = np.cos(yaw), np.sin(yaw)
+                for i in range(count):
+                    turned[i, 0] = (cosine * points[i, 0] - sine * points[i, 1]) * scale[i]
+                    turned[i, 1] = (sine * points[i, 0] + cosine * points[i, 1]) * scale[i]
+            x0, y0 = cells[c, 0] - origin[0], cells[c, 1] - origin[1]
+            total = 0
+            for i in range(count):
+                x, y = x0 * scale[i] + turned[i, 0], y0 * scale[i] + turned[i, 1]
+                if 0.0 <= x < width[i] and 0.0 <= y < height[i]:
+                    total += field[offset[i] + int(x) * height[i] + int(y)]
+            out[c] = total / (255.0 * count)
     return out
 
 

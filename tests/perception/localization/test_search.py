@@ -5,8 +5,8 @@ from simtrack.geometry.transforms import angle_between, transform_planar
 from simtrack.perception.localization.config import MotionConfig, SearchConfig
 from simtrack.perception.localization.measurement import Measurement, deskew
 from simtrack.perception.localization.motion import OdometryTrack
-from simtrack.perception.localization.search import SearchMap, build_search_map, search, search_points
-from simtrack.perception.localization.search_kernels import bound_cells, expand_cells
+from simtrack.perception.localization.search import SearchMap, _best, build_search_map, search, search_points
+from simtrack.perception.localization.search_kernels import bound_cells, expand_cells, grid_totals
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +44,32 @@ def test_bounds_are_never_below_what_a_cell_holds(office_world, office_map) -> N
         for centre, bound in zip(centres, bounds, strict=True):
             inside = centre + rng.uniform(-0.5, 0.5, (60, 3)) * [cell, cell, step]
             assert likelihood(inside, points, layers, office_map, 0.0, 0.0, 0).max() <= bound + 1e-12
+
+
+def test_whole_rows_are_bounded_as_cell_by_cell(office_world, office_map) -> None:
+    """Sums over rows of cells are those of the cells, inside of the map and beyond its rim."""
+    config = SearchConfig()
+    points, layers = search_points(measure(office_world, transform_planar(3.0, 2.5, 0.4)), config)
+    yaws, low, shape = np.array([-0.7, 0.0, 2.1]), np.array([2, 0]), np.array([30, office_map.planes.shape[5]])
+    sizes = config.coarse_cell, config.coarse_yaw
+    totals = grid_totals(
+        office_map.planes, office_map.first, points, layers, yaws, office_map.resolution, *sizes, low, shape
+    )
+    grid = np.stack(np.meshgrid(yaws, *map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.roll(grid, -1, axis=1)
+    cells[:, :2] = (cells[:, :2] + low + 0.5) * config.coarse_cell + office_map.origin
+    single = likelihood(cells, points, layers, office_map, *sizes, 1)
+    np.testing.assert_array_equal(totals.ravel(), np.round(single * 255.0 * len(points)))
+
+
+def test_the_best_are_those_of_a_sorted_list() -> None:
+    rng = np.random.default_rng(0)
+    for count in (1, 7, 100, 1000):
+        totals = rng.integers(0, 50, 300).astype(np.int32)
+        kept = _best(totals, 0.5, count)
+        able = np.flatnonzero(totals >= 0.5 * totals.max())
+        assert (np.diff(kept) > 0).all() and len(kept) == min(count, len(able))
+        assert sorted(totals[kept], reverse=True) == sorted(totals[able], reverse=True)[:count]
 
 
 def test_halves_of_a_cell_fill_it() -> None:
