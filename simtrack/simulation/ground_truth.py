@@ -127,10 +127,11 @@ class GroundTruth:
         self._history.load(early, scratch)
         before = body_poses(scratch, bodies)
         self._history.load(late, scratch)
-        after = body_poses(scratch, bodies)
+        after = poses = body_poses(scratch, bodies)
         seconds = max(late - early, 1) / NANOSECONDS
-        self._history.load(stamp, scratch)
-        poses = body_poses(scratch, bodies)
+        if stamp != late:  # which is now
+            self._history.load(stamp, scratch)
+            poses = body_poses(scratch, bodies)
         moved = (after != before).any(axis=(1, 2)).tolist()  # most things rest
         objects = {
             name: ObjectTruth(
