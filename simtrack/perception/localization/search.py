@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtrack.contracts import Float64, StaticMap
+from simtrack.contracts import Bool, Float64, StaticMap
 from simtrack.geometry.transforms import transform_planar
 from simtrack.perception.localization.config import SearchConfig
 from simtrack.perception.localization.measurement import Measurement
@@ -165,29 +165,27 @@ def _coarse_cells(
     free = search_map.free
     padded = np.zeros([-(-n // comb) * comb for n in free.shape], bool)
     padded[: free.shape[0], : free.shape[1]] = free
-    wanted = padded.reshape(padded.shape[0] // comb, comb, -1, comb).any(axis=(1, 3))
-    centres = [
+    wanted: Bool = np.asarray(padded.reshape(padded.shape[0] // comb, comb, -1, comb).any(axis=(1, 3)))
+    x, y = (
         (np.arange(n) + 0.5) * comb * resolution + low for n, low in zip(wanted.shape, search_map.origin, strict=True)
-    ]
-    yaws = np.arange(int(np.ceil(2 * np.pi / step))) * step
+    )
+    yaws: Float64 = np.arange(int(np.ceil(2 * np.pi / step))) * np.float64(step)
     if window is not None:
         T, half, half_yaw = window
-        near = [np.abs(c - at) <= half + cell / 2 for c, at in zip(centres, T[:2, 3], strict=True)]
-        wanted &= near[0][:, None] & near[1]
+        wanted &= (np.abs(x - T[0, 3]) <= half + cell / 2)[:, None] & (np.abs(y - T[1, 3]) <= half + cell / 2)
         turns = int(np.ceil(half_yaw / step))
         yaws = np.arctan2(T[1, 0], T[0, 0]) + np.arange(-turns, turns + 1) * step
     if not wanted.any():
         return np.zeros((0, 3))
-    sides = [np.flatnonzero(wanted.any(axis=1 - axis)) for axis in (0, 1)]
-    low = np.array([side[0] for side in sides])
-    shape = np.array([side[-1] + 1 for side in sides]) - low
+    places = np.argwhere(wanted)
+    low = places.min(axis=0)
+    shape = places.max(axis=0) + 1 - low
     points, layers = points[: config.points[0]], layers[: config.points[0]]
     totals = grid_totals(search_map.planes, search_map.first, points, layers, yaws, resolution, cell, step, low, shape)
-    columns, rows = np.nonzero(wanted[low[0] : low[0] + shape[0], low[1] : low[1] + shape[1]])
-    score = totals[:, columns, rows]
-    kept = _best(score.ravel(), config.keep, config.beam[0])
-    turn, place = kept // len(columns), kept % len(columns)
-    return np.stack([centres[0][columns[place] + low[0]], centres[1][rows[place] + low[1]], yaws[turn]], axis=1)
+    columns, rows = (places - low).T
+    kept = _best(totals[:, columns, rows].ravel(), config.keep, config.beam[0])
+    turn, place = kept // len(places), kept % len(places)
+    return np.stack([x[places[place, 0]], y[places[place, 1]], yaws[turn]], axis=1).astype(np.float64)
 
 
 def _best(totals: np.ndarray, share: float, count: int) -> np.ndarray:
