@@ -1,7 +1,10 @@
 """The world, the robot's sensors and what is made of them, one control step at a time."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 
 from simtrack.contracts import Belief, Command, DetectionResult, JointState, Odometry, RgbdFrame, SensorFrame
@@ -119,6 +122,10 @@ class Loop:
 
     def step(self, command: Command, request: Request | None = None) -> Snapshot:
         """Run for one control step under a command; what the arm is asked for begins if it is not at work."""
+        with _one_thread():
+            return self._step(command, request)
+
+    def _step(self, command: Command, request: Request | None) -> Snapshot:
         simulation = self.simulation
         if self.manipulator is not None:
             if request is not None and not self.manipulator.busy and self._belief is not None:
@@ -163,6 +170,17 @@ class Loop:
         """Release everything; may be called twice."""
         self._end_stack()
         self.simulation.close()
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compiled kernels keep to the calling thread, as the stack does: others would wait busily for their next turn."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 def _without_threads(config: StackConfig) -> StackConfig:

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
+import numba
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -54,6 +55,27 @@ def fingerprint(env: SimtrackEnv, seed: int, steps: int) -> str:
         observation, reward, *_, info = env.step(rng.uniform(-1, 1, 5).astype(np.float32))
         sha.update(np.float64(reward).tobytes())
     return sha.hexdigest()
+
+
+def test_a_step_keeps_to_one_thread_and_leaves_the_caller_his(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make(observation="belief")
+    env.reset(seed=0)
+    assert env.loop is not None
+    advance, seen = env.loop.simulation.advance, []
+
+    def watched(*arguments: Any, **named: Any) -> Any:
+        seen.append(numba.get_num_threads())
+        return advance(*arguments, **named)
+
+    monkeypatch.setattr(env.loop.simulation, "advance", watched)
+    before = numba.get_num_threads()
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+    try:
+        env.step(np.zeros(5, np.float32))
+        assert seen == [1]
+        assert numba.get_num_threads() == numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+    finally:
+        numba.set_num_threads(before)
 
 
 MODES = ("state", "belief")
