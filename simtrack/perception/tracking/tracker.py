@@ -207,6 +207,9 @@ class ObjectTracker:
         """Whether enough has been seen of a new object to believe in it."""
         if not fits_noise(result, self.config.fit, self._noise.value) or target.frames < self.config.confirm_frames:
             return False
+        alike = [t for t in self._targets if t is not target and t.model is target.model and t.alive]
+        if target.newcomer and any(t.missing_since is not None for t in alike):
+            return False  # one of its kind is being seen to be gone: it may be this one
         # A fit that leaves no doubt needs no second detection.
         clear = not target.doubtful(self.config) and not target.vague(self.config)
         return target.detections >= (1 if clear else self.config.confirm_detections)
