@@ -37,6 +37,7 @@ from simtrack.perception.tracking.claims import Claim, ClaimQueue, Views
 from simtrack.perception.tracking.correspondences import usable_depth
 from simtrack.perception.tracking.filter import Measurement, PoseFilter
 from simtrack.perception.tracking.follow_up import Candidate, measurement
+from simtrack.perception.tracking.identity import all_seen, one_vanishes, reappeared, replaced
 from simtrack.perception.tracking.registration import Registration, RegistrationResult
 from simtrack.perception.tracking.target import (
     Target,
@@ -207,9 +208,8 @@ class ObjectTracker:
         """Whether enough has been seen of a new object to believe in it."""
         if not fits_noise(result, self.config.fit, self._noise.value) or target.frames < self.config.confirm_frames:
             return False
-        alike = [t for t in self._targets if t is not target and t.model is target.model and t.alive]
-        if target.newcomer and any(t.missing_since is not None for t in alike):
-            return False  # one of its kind is being seen to be gone: it may be this one
+        if one_vanishes(self._targets, target):
+            return False
         # A fit that leaves no doubt needs no second detection.
         clear = not target.doubtful(self.config) and not target.vague(self.config)
         return target.detections >= (1 if clear else self.config.confirm_detections)
@@ -254,19 +254,17 @@ class ObjectTracker:
 
     def _reunite(self, now: int) -> None:
         """What turned up a moment before a known object of its class was seen to be gone is that object."""
-        for new in [t for t in self._targets if t.newcomer and t.status is TrackStatus.CONFIRMED]:
-            if now - new.born > self.config.reunite_time * NANOSECONDS:
+        for new in list(self._targets):
+            before = replaced(self._targets, new, now, self.config)
+            if before is None:
                 continue
-            gone = [t for t in self._targets if t.model is new.model and t.gone and t is not new]
-            if gone:
-                before = max(gone, key=lambda t: t.last_seen)
-                self._targets.remove(before)
-                if before.alive:
-                    self._registration.remove(before.id)
-                self._registration.remove(new.id)
-                new.id, new.known, new.newcomer = before.id, True, False
-                new.believed += before.believed
-                self._registration.add(new.id, self._tracked[new.model.name])
+            if before.alive:
+                self._registration.remove(before.id)
+            self._targets.remove(before)
+            self._registration.remove(new.id)
+            before.status = TrackStatus.LOST
+            new.id, new.known, new.newcomer, new.believed = before.id, True, False, new.believed + before.believed
+            self._registration.add(new.id, self._tracked[new.model.name])
 
     # -------------------------------------------------------------------------------------------------- late detections
 
@@ -405,9 +403,7 @@ class ObjectTracker:
         target = self._known_before(model, followed) or self._newcomer(model, followed, view)
         target.filter, target.last_seen = followed, followed.state.stamp
         target.residual, target.missing_since = result.residual, None
-        others = [t for t in self._targets if t is not target and t.model is model and t.alive and t.known]
-        # One that is not seen may be this one: that it is gone has to be seen first.
-        target.frames = candidate.frames if all(t.last_seen >= followed.state.stamp for t in others) else 0
+        target.frames = candidate.frames if all_seen(self._targets, target, followed.state.stamp) else 0
         self._registration.add(target.id, self._tracked[model.name])
 
     def _around(self, view: View, but: Target | None = None) -> Occluders:
@@ -437,28 +433,13 @@ class ObjectTracker:
         return target
 
     def _known_before(self, model: ObjectModel, followed: PoseFilter) -> Target | None:
-        """The target that a reappearing object is: a lost one, or one that was being moved when last seen."""
-        lost = [t for t in self._targets if not t.alive and t.model is model]
-        if lost:
-            return self._revive(max(lost, key=lambda t: t.last_seen), followed.state.stamp)
-        for target in self._targets:
-            unseen = target.status in (TrackStatus.OCCLUDED, TrackStatus.OUT_OF_VIEW) and target.moved_when_seen
-            demoted = target.status is TrackStatus.TENTATIVE and target.known
-            age = (followed.state.stamp - target.last_seen) / NANOSECONDS
-            if target.model is not model or not (unseen or demoted):
-                continue
-            distance = np.linalg.norm(followed.state.T_map_object[:3, 3] - target.filter.state.T_map_object[:3, 3])
-            reach = 0.15 + self.config.same_object_speed * min(age, self.config.same_object_memory)
-            # What is not believed any more where it was is not somewhere else for being long unseen.
-            if (demoted or age < self.config.same_object_memory) and distance < reach:
-                self._registration.remove(target.id)
-                return self._revive(target, followed.state.stamp)
-        return None
-
-    @staticmethod
-    def _revive(target: Target, stamp: int) -> Target:
-        """A known object has turned up again: it keeps its identity and is believed after another detection."""
-        target.status, target.born, target.newcomer = TrackStatus.TENTATIVE, stamp, False
+        """The target that a reappearing object is: it keeps its identity and is believed after another detection."""
+        target = reappeared(self._targets, model, followed, self.config)
+        if target is None:
+            return None
+        if target.alive:
+            self._registration.remove(target.id)
+        target.status, target.born, target.newcomer = TrackStatus.TENTATIVE, followed.state.stamp, False
         target.detections, target.frames = 1, 0
         return target
 
