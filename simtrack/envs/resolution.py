@@ -11,9 +11,8 @@ LIDAR_SEGMENTS = 3
 """Every how many-th scan is segmented: what stands in the way of a robot stands there for longer than half a second."""
 FEWEST_RAYS, FEWEST_EDGES = 8, 4
 """However small an image is, so many rays must confirm a pose, and so many silhouette pixels a new object."""
-
 LEAST_SUPPORT = 0.8
-"""... and this share of the rays that meet a new object has to confirm it."""
+"""However few rays meet a new object, this share of them has to confirm it."""
 
 
 def stack_config(scale: float) -> StackConfig:
@@ -24,7 +23,7 @@ def stack_config(scale: float) -> StackConfig:
         fit,
         pixels=max(FEWEST_RAYS, round(fit.pixels * scale**2)),
         edges=max(FEWEST_EDGES, round(fit.edges * scale)),
-        # Shares and means of fewer rays scatter more: by one over the root of their number.
+        # Shares and means of fewer rays scatter more: as one over the root of their number.
         support=max(LEAST_SUPPORT, 1.0 - (1.0 - fit.support) / scale),
         misfit=1.0 + (fit.misfit - 1.0) / scale,
         good_misfit=1.0 + (fit.good_misfit - 1.0) / scale,

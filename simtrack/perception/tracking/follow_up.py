@@ -43,17 +43,14 @@ class Candidate:
         elsewhere: it is looked for where it was before the robot.
         """
         for view, around in views:
-
-            def registered(T: Float64, view: View = view, around: Occluders = around) -> RegistrationResult | None:
-                result = prober.follow(T, self.model, view.depth, view.intrinsics, around)
-                return result if result is not None and believable(result, config.fit, view.noise) else None
-
             self.reached = view.stamp
-            result = registered(inverse(view.T_map_camera) @ self.filter.predict(view.stamp).T_map_object)
+            in_map = inverse(view.T_map_camera) @ self.filter.predict(view.stamp).T_map_object
+            result = self._registered(in_map, prober, view, around, config)
             if result is not None:
                 self.filter.update(measurement(view, result, self.seen, config))
             else:
-                result = registered(inverse(view.T_base_camera) @ self.T_base_object)
+                before_robot = inverse(view.T_base_camera) @ self.T_base_object
+                result = self._registered(before_robot, prober, view, around, config)
                 if result is None:
                     self.filter.skip(view.stamp)
                     continue
@@ -61,6 +58,13 @@ class Candidate:
             self.T_base_object = view.T_base_camera @ result.T_camera_object
             self.seen = view.stamp
             self.frames += 1
+
+    def _registered(
+        self, T_camera_object: Float64, prober: Prober, view: View, around: Occluders, config: TrackerConfig
+    ) -> RegistrationResult | None:
+        """Registered to a view from a pose (4, 4), if what comes of it can be believed."""
+        result = prober.follow(T_camera_object, self.model, view.depth, view.intrinsics, around)
+        return result if result is not None and believable(result, config.fit, view.noise) else None
 
     @property
     def lost(self) -> bool:

@@ -182,9 +182,10 @@ class ObjectTracker:
             # It was moved while nobody looked, and its surface alone does not tell how: detections have to.
             self._demote(target, view.stamp)
         taken = measurement(view, result, target.last_seen, self.config)
-        poor = result.misfit > self.config.poor_misfit
-        # What is held far away fits the fingers before it nearly as well.
-        poor |= target.vague(self.config) and not fits_noise(result, self.config.fit, view.noise)
+        # What is held far away, and is vague, fits the fingers before it nearly as well.
+        poor = result.misfit > self.config.poor_misfit or (
+            target.vague(self.config) and not fits_noise(result, self.config.fit, view.noise)
+        )
         if target.known and (poor or self._incredible(target, taken)):
             target.filter.skip(view.stamp)
             target.doubts += 1

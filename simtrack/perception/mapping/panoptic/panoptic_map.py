@@ -161,7 +161,7 @@ class PanopticMap:
         if self.regions is not None:
             self.regions.approach(now[1][:3, 3])
         try:
-            self.volume.touched(depth, frame.intrinsics, T_map_camera)
+            listed = self.volume.touched(depth, frame.intrinsics, T_map_camera)
         except InvalidValueError as error:
             return self._skip(frame, str(error))
         met, counts = self.volume.overlaps(
@@ -176,7 +176,7 @@ class PanopticMap:
         self.counts.observe(_observations(segments, labels, panoptic))
         same = self.counts.same(self.labels.canonical)
         image = labels[segments.image]
-        blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera, same)
+        blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera, same, listed)
         for label, other in self.labels.count_overlaps(met, counts[segments.geometric], least):
             self._merge(label, other)
         self.frames += 1

@@ -107,7 +107,7 @@ class Volume:
 
     def integrate(
         self, depth: Float32, rgb: Uint8 | None, labels: Int32, intrinsics: CameraIntrinsics, T_map_camera: Float64,
-        same: Int32 | None = None,
+        same: Int32 | None = None, listed: Int32 | None = None,
     ) -> int:  # fmt: skip
         """Fuse one image; the results do not depend on the number of threads.
 
@@ -118,6 +118,7 @@ class Volume:
             intrinsics: of the image.
             T_map_camera: (4, 4).
             same: (L,), labels with the same number support each other in a voxel; None: each stands for itself.
+            listed: (B,), what `touched` has told of this image; None: it is asked.
 
         Returns:
             Blocks that it was fused into.
@@ -125,7 +126,8 @@ class Volume:
         Raises:
             InvalidValueError: more blocks would be needed than are allowed; the volume is as it was.
         """
-        listed = self.touched(depth, intrinsics, T_map_camera)
+        if listed is None:
+            listed = self.touched(depth, intrinsics, T_map_camera)
         if same is None:
             most = max(int(self.labels[: self.count].max(initial=0)), int(labels.max(initial=0)))
             same = np.arange(most + 1, dtype=np.int32)
