@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from simtrack.contracts import Status
+from simtrack.contracts import CameraIntrinsics, RgbdFrame, Status
 from simtrack.errors import InvalidValueError, UnknownNameError
 from simtrack.evaluation.map_sources import map_source
 from simtrack.geometry.transforms import is_rigid
@@ -69,6 +69,20 @@ def disagreement(film: RoomFilm, room: SettledRoom, strength: float) -> float:
 def test_the_oracle_is_right_at_strength_0_and_errs_more_with_more(film: RoomFilm, room: SettledRoom) -> None:
     errors = [disagreement(film, room, strength) for strength in (0.0, 0.5, 2.0)]
     assert errors[0] == 0.0 < errors[1] < errors[2]
+
+
+def test_walls_and_floors_are_wrong_more_often_than_things() -> None:
+    labels = np.zeros((60, 80), np.int32)
+    labels[:, 40:] = 1
+    frame = RgbdFrame(
+        0, np.ones((60, 80), np.float32), None, CameraIntrinsics(80, 60, 70.0, 70.0, 39.5, 29.5), np.eye(4)
+    )
+    told = []
+    for seed in range(200):
+        answer = OracleSegmenter(lambda stamp: labels, ("wall", "fridge"), 1.0, seed).segment(frame)
+        told.append([name in answer.classes for name in ("wall", "fridge")])
+    wall, fridge = np.mean(told, axis=0).tolist()
+    assert 0.1 < wall < fridge - 0.1
 
 
 def test_a_room_is_mapped_from_its_film(film: RoomFilm, room: SettledRoom) -> None:

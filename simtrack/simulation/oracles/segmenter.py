@@ -32,27 +32,29 @@ CONFUSED: Mapping[str, tuple[str, ...]] = {
 class SegmenterErrors:
     """Errors at strength 1. They were set once, by what the map without joint fusion reaches, and stay."""
 
-    wrong_class: float = 0.26
+    wrong_class: float = 0.21
     """Share of epochs in which a thing is taken for something else."""
-    missed: float = 0.22
+    missed: float = 0.21
     """... in which it is not found; small ones are missed more often."""
     small: float = 30.0
     """Pixels: a thing that covers the square of it is missed in half of the rest of the images."""
-    flicker: float = 0.2
+    flicker: float = 0.21
     """Share of images in which a thing that was found is not, or is taken for something else."""
-    split: float = 0.24
+    split: float = 0.21
     """Share of epochs in which one thing is seen as two."""
-    merged: float = 0.24
+    merged: float = 0.21
     """... in which a thing and one of the same class or size beside it are seen as one."""
-    leak: float = 0.7
+    leak: float = 0.5
     """... in which a thing's mask reaches far over its border."""
-    leak_size: float = 0.6
+    leak_size: float = 0.5
     """How far it does, as a share of the root of its area."""
-    filled: float = 0.9
+    filled: float = 0.7
     """... in which the gaps of a thing, and what is seen through them, are taken for part of it."""
     filled_size: float = 0.5
     """How wide such gaps are, as a share of the root of its area."""
-    ragged: float = 9.0
+    stuff: float = 2.0
+    """How many times as often walls and floors are wrong; a part of a split one is taken for something else."""
+    ragged: float = 3.5
     """Pixels of 640: standard deviation of the borders."""
     epoch: float = 2.0
     """Seconds that an error lasts."""
@@ -121,34 +123,35 @@ class OracleSegmenter:
         original = image.copy()
         for number, area in areas.items():
             rng = self._lasting(number, stamp)
-            luck = rng.random(6) / max(s, 1e-9)
-            side, wrong, other = rng.uniform(0.0, 2.0 * np.pi), rng.random(), rng.uniform(-0.25, 0.25)
-            fleeting, kind = flicker.random() / max(s, 1e-9), flicker.random()
             stuff = names[number] in STUFF
+            often = max(s * (errors.stuff if stuff else 1.0), 1e-9)
+            luck = rng.random(6) / often
+            side, wrong, other = rng.uniform(0.0, 2.0 * np.pi), rng.random(), rng.uniform(-0.25, 0.25)
+            fleeting, kind = flicker.random() / often, flicker.random()
             mine = original == number
             vanishes = min(s, 1.0) * 0.5 / (1.0 + (area / max((errors.small * scale) ** 2, 1e-9)) ** 2)
-            if luck[0] < errors.missed * (0.3 if stuff else 1.0) or flicker.random() < vanishes:
+            if luck[0] < errors.missed or flicker.random() < vanishes:
                 image[mine & (image == number)] = -1
                 continue
-            if fleeting < errors.flicker and kind < 0.5 and not stuff:
+            if fleeting < errors.flicker and kind < 0.5:
                 image[mine & (image == number)] = -1
                 continue
-            if luck[1] < errors.wrong_class * (0.25 if stuff else 1.0) or (fleeting < errors.flicker and not stuff):
-                choices = CONFUSED.get(self._classes[number], ("box",))
-                taken_for = choices[0 if wrong < 0.65 else -1]
+            choices = CONFUSED.get(self._classes[number], ("box",))
+            taken_for = choices[0 if wrong < 0.65 else -1]
+            if luck[1] < errors.wrong_class or fleeting < errors.flicker:
                 names.append(taken_for)
                 image[image == number] = len(names) - 1
                 number = len(names) - 1
-            if luck[2] < errors.split and not stuff:
+            if luck[2] < errors.split:
                 image[mine & (image == number) & _half(mine, side, other)] = len(names)
-                names.append(names[number])
+                names.append(taken_for if stuff else names[number])
             elif luck[3] < errors.merged and not stuff:
                 beside = self._beside(original, mine, number, names)
                 if beside is not None:
                     image[image == beside] = number
             if luck[5] < errors.filled and not stuff:
                 _fill(image, mine, number, min(errors.filled_size * s * np.sqrt(area), 40.0 * scale))
-            if luck[4] < errors.leak * (0.3 if stuff else 1.0):
+            if luck[4] < errors.leak:
                 reach = errors.leak_size * s * np.sqrt(area) * (0.5 + wrong)
                 _leak(image, mine, number, side, min(reach, 90.0 * scale))
         return _warped(image, s * errors.ragged * scale, flicker, self._lasting(-1, stamp)), names

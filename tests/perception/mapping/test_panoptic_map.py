@@ -33,6 +33,7 @@ from simtrack.perception.mapping.panoptic.layout import split_layout
 from simtrack.perception.mapping.panoptic.map_file import read_map, write_map
 from simtrack.perception.mapping.panoptic.panoptic_map import Method, PanopticMap, PanopticMapConfig
 from simtrack.perception.mapping.panoptic.regions import SwapConfig
+from simtrack.perception.mapping.panoptic.shell import is_upright, shell_labels
 from simtrack.perception.mapping.panoptic.volume import STORED, Volume, VolumeConfig
 from simtrack.perception.segmentation.panoptic import PanopticSegments
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
@@ -287,6 +288,78 @@ def test_segments_of_one_entity_and_what_was_merged_support_each_other_in_a_voxe
         volume.integrate(frame.depth, None, 2 * label, CAMERA, T, alike)
         held = volume.support[: volume.count][volume.labels[: volume.count] == 1]
         assert len(held) > 1000 and (held == support).all()
+
+
+def test_what_no_mask_covers_speaks_against_no_label_and_what_is_split_out_counts_more() -> None:
+    frame, T, _ = views(1)[0]
+    ones = np.ones((120, 160), np.int32)
+
+    def fused(*images: np.ndarray, votes: np.ndarray | None = None) -> tuple[set[int], set[int]]:
+        volume = Volume(VolumeConfig(voxel=VOXEL))
+        for image in images:
+            same = np.arange(4, dtype=np.int32)
+            volume.integrate(frame.depth, None, image, CAMERA, T, same, votes=votes)
+        labels, support = volume.labels[: volume.count], volume.support[: volume.count]
+        return set(labels[labels > 0].tolist()), set(support[labels > 0].tolist())
+
+    assert fused(ones, -2 * ones, -2 * ones) == ({1}, {1})
+    assert fused(-2 * ones, ones) == ({1}, {1})
+    assert fused(-2 * ones) == ({2}, {0})
+    votes = np.array([1, 1, 3, 1], np.int16)
+    assert fused(ones, ones, 2 * ones, 2 * ones, votes=votes) == ({2}, {3})
+    assert fused(ones, ones, 2 * ones, 2 * ones) == ({1}, {0})
+
+
+def test_readings_beside_the_mask_of_their_segment_are_not_its_own() -> None:
+    frame, T, segments = views(1)[0]
+    image = segments.image.copy()
+    image[60:] = 0  # the lower half of the image was not found
+    half = replace(segments, image=image)
+    for doubt in (True, False):
+        config = PanopticMapConfig.of_method("full", VOXEL)
+        panoptic_map = PanopticMap(replace(config, fusion=replace(config.fusion, doubt=doubt, fill=False)))
+        assert panoptic_map.integrate(frame, T, half, segments.image).status is Status.OK
+        support = panoptic_map.volume.support[panoptic_map.volume.labels > 0]
+        assert (support == 1).any() and (support == 0).any() == doubt
+
+
+def test_floor_and_walls_are_told_from_geometry_where_masks_disagree() -> None:
+    room = [box_mesh((4.0, 3.0, 0.1)), box_mesh((0.1, 3.0, 2.5)), box_mesh((1.2, 0.5, 0.9)), box_mesh((1.2, 0.02, 0.8))]
+    places = np.array([[0.0, 0.0, -0.05], [-2.05, 0.0, 1.25], [0.9, 1.0, 0.45], [0.0, -0.9, 1.6]])
+    meshes = [Mesh(m.vertices + at, m.faces) for m, at in zip(room, places, strict=True)]
+    faces, vertices, labels, at = [], [], [], 0
+    for label, mesh in enumerate(meshes, start=1):
+        vertices.append(mesh.vertices)
+        faces.append(mesh.faces + at)
+        labels.append(np.full(len(mesh.faces), label, np.int32))
+        at += len(mesh.vertices)
+    surface = Mesh(np.concatenate(vertices), np.concatenate(faces).astype(np.int32))
+    normals, of_face = face_normals(surface), np.concatenate(labels)
+    # Of floor and wall only what faces the room is seen.
+    seen = (of_face > 2) | (of_face == 1) & (normals[:, 2] > 0.5) | (of_face == 2) & (normals[:, 0] > 0.5)
+    shown = Mesh(surface.vertices, surface.faces[seen])
+    found = shell_labels(shown, of_face[seen])
+    assert found == {1: "floor", 2: "wall", 3: "", 4: ""}
+
+    names = np.array(["", "floor", "wall", "cabinet", "board"], dtype=object)[of_face[seen]]
+    lying = Mesh(surface.vertices[:, [2, 0, 1]], surface.faces[seen])  # as a camera sees it whose poses nobody stated
+    assert is_upright(shown, names) and not is_upright(lying, names)
+    names[names == "floor"] = ""
+    assert is_upright(shown, names) and not is_upright(shown, np.full(len(names), "", dtype=object))
+
+    counts = JointCounts()
+    for name, times in (("table", 5), ("floor", 3), ("wall", 2)):
+        for _ in range(times):
+            counts.observe([Observation(name, (1,))])
+    for name, times in (("wall", 5), ("cabinet", 3)):
+        for _ in range(times):
+            counts.observe([Observation(name, (3,))])
+    alone, told = counts.entities(), counts.entities(found)
+    assert (alone[1].semantic_class, alone[3].semantic_class) == ("table", "wall")
+    assert (told[1].semantic_class, told[3].semantic_class) == ("floor", "cabinet")
+    assert (told[1].agreeing, told[1].observed) == (3, 10)
+    assert counts.entities({9: "wall"}) == alone
+    assert shell_labels(Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32)), np.empty(0, np.int32)) == {}
 
 
 def test_scores_rise_with_what_agrees_and_with_how_much_there_is() -> None:

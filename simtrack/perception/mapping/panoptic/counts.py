@@ -68,8 +68,12 @@ class PanopticCounts(Protocol):
         """Merge instances that are one."""
         ...
 
-    def entities(self) -> Mapping[int, SegmentEntity]:
-        """Global segment -> what it is part of; background is missing."""
+    def entities(self, shell: Mapping[int, str] | None = None) -> Mapping[int, SegmentEntity]:
+        """Global segment -> what it is part of; background is missing.
+
+        Args:
+            shell: what of a room's shell global segments lie on, see `shell.shell_labels`, where that weighs in.
+        """
         ...
 
     def state(self) -> dict[str, Any]:
@@ -100,6 +104,9 @@ class CountsConfig:
     """... and how many times the frames it must be in which each was a thing of its own."""
     labelled: float = 0.35
     """Share of the frames that see a segment in which something must cover it, for it not to be background."""
+    shell: float = 3.0
+    """How many times as much observations count that take a segment for what of the room's shell it lies on, and how
+    many times less those that take it for stuff which it does not lie on."""
 
 
 class JointCounts:
@@ -196,9 +203,13 @@ class JointCounts:
                 self._merge_instances(name, instances[max(first, second)], instances[min(first, second)])
         self._merge_seen_as_one()
 
-    def entities(self) -> Mapping[int, SegmentEntity]:
-        """Eq. 6."""
-        found = ((label, self._entity(label)) for label in sorted(self.phi))
+    def entities(self, shell: Mapping[int, str] | None = None) -> Mapping[int, SegmentEntity]:
+        """Eq. 6; stuff is weighed by whether a segment lies on the shell of the room."""
+        lies_on = {} if shell is None else shell
+        found = (
+            (label, self._found_entity(label, lies_on[label]) if label in lies_on else self._entity(label))
+            for label in sorted(self.phi)
+        )
         return {label: entity for label, entity in found if entity is not None}
 
     def state(self) -> dict[str, Any]:
@@ -257,11 +268,13 @@ class JointCounts:
             self._entities[label] = self._found_entity(label)
         return self._entities[label]
 
-    def _found_entity(self, label: int) -> SegmentEntity | None:
-        classes: dict[str, int] = defaultdict(int)
+    def _found_entity(self, label: int, lies_on: str | None = None) -> SegmentEntity | None:
+        classes: dict[str, float] = defaultdict(float)
         counts = self.phi.get(label, {})
         for (name, _), count in counts.items():
-            classes[name] += count
+            stuff = lies_on is not None and name in self.config.stuff
+            weight = 1.0 if not stuff else self.config.shell if name == lies_on else 1.0 / self.config.shell
+            classes[name] += weight * count
         name = _winner(classes, self.config.labelled)
         if name is None:
             return None
@@ -343,8 +356,11 @@ class SeparateCounts:
     def regularize(self) -> None:
         """Nothing: instances are not merged."""
 
-    def entities(self) -> Mapping[int, SegmentEntity]:
-        """The likeliest instance of each segment; its class is the one that most was counted for on its segments."""
+    def entities(self, shell: Mapping[int, str] | None = None) -> Mapping[int, SegmentEntity]:
+        """The likeliest instance of each segment; its class is the one that most was counted for on its segments.
+
+        The shell does not weigh in: Voxblox++ knows of none.
+        """
         own: dict[int, int] = {}
         votes: dict[int, dict[str, int]] = defaultdict(lambda: defaultdict(int))
         for label in sorted(self.instances):
@@ -400,7 +416,7 @@ def _add_pairs(table: dict[tuple[int, int], int], members: Iterable[int]) -> Non
         table[pair] += 1
 
 
-def _winner(classes: Mapping[str, int], labelled: float) -> str | None:
+def _winner(classes: Mapping[str, float], labelled: float) -> str | None:
     """The class with the greatest count, of equal ones the first by name; None for background."""
     total, named = sum(classes.values()), {name: count for name, count in classes.items() if name != BACKGROUND}
     if not named or sum(named.values()) < labelled * total:

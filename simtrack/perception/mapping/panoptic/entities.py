@@ -121,7 +121,7 @@ def extract_surface(volume: Volume, least_weight: float) -> Surface:
 
 
 def extract_entities(
-    volume: Volume,
+    surface: Surface,
     canonical: Int32,
     entities: Mapping[int, SegmentEntity],
     config: EntityConfig | None = None,
@@ -129,13 +129,12 @@ def extract_entities(
     """One mesh an entity.
 
     Args:
-        volume: the map.
+        surface: of the map.
         canonical: (L,), what each label was merged into.
         entities: global segment -> class and instance (Eq. 6).
         config: settings, the defaults if None.
     """
     config = config or EntityConfig()
-    surface = extract_surface(volume, config.least_weight)
     parts: dict[tuple[str, int], list[SegmentEntity]] = defaultdict(list)
     for each in entities.values():
         parts[each.semantic_class, each.instance].append(each)
@@ -174,8 +173,9 @@ def extract_entities(
 def _least_observed(entities: Mapping[int, SegmentEntity], config: EntityConfig) -> int:
     """Observations that a thing needs, see `EntityConfig.doubt`."""
     things = [each for each in entities.values() if each.semantic_class not in STUFF_FIRST]
-    observed, agreeing = sum(each.observed for each in things), sum(each.agreeing for each in things)
-    wrong = (observed - agreeing + 1) / (observed + 2)  # rule of succession: of few, little is known
+    # Of those that a segment is taken for one speaks for itself, and tells nothing.
+    others, disagreeing = sum(e.observed - 1 for e in things), sum(e.observed - e.agreeing for e in things)
+    wrong = (disagreeing + 1) / (others + 2)  # rule of succession: of few, little is known
     if config.doubt <= 0.0:
         return config.least_observed
     return int(np.clip(np.ceil(np.log(config.doubt) / np.log(wrong)), 1, config.least_observed))

@@ -52,7 +52,7 @@ def write_surface(panoptic_map: PanopticMap, entities: Sequence[MapEntityMesh], 
     known = {(entity.semantic_class, entity.instance) for entity in entities}
     canonical = panoptic_map.labels.canonical
     ids = np.zeros((len(canonical), 2), np.int32)
-    for label, each in panoptic_map.counts.entities().items():
+    for label, each in panoptic_map.told_segments(surface).items():
         if (each.semantic_class, each.instance) in known:
             ids[label] = classes[each.semantic_class], each.instance
     of_vertex = np.zeros((len(surface.vertices), 2), np.int32)

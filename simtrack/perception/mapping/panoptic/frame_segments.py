@@ -53,6 +53,12 @@ class FrameFusionConfig:
     hidden: tuple[float, float] = (0.4, 0.2)
     """Metres from the largest cluster, and share of its readings, up to which what is cut off from it is taken for a
     part of it to which the way is hidden, as the foot of a table is below its top; zeros: never, as in the paper."""
+    doubt: bool = True
+    """Whether readings of a segment beside the mask that it took say nothing of its surface: a book that was not found
+    in an image is in one segment with the table and not in its mask ..."""
+    split_votes: int = 2
+    """... and observations that one of a mask which is split out of a geometric segment counts for: networks miss what
+    is there far more often than they find what is not."""
     flat: bool = True
     """Whether small segments of stuff that lie off the planes of its large ones say nothing in this frame: what stands
     before a wall and was not found is not wall."""
@@ -74,20 +80,25 @@ class FrameFusionConfig:
         for name in ("off_plane", "plane_area"):
             if not 0.0 < getattr(self, name) < 100.0:
                 raise InvalidValueError(f"FrameFusionConfig.{name}", getattr(self, name), "above 0 and below 100")
-        if self.min_pixels < 1:
-            raise InvalidValueError("FrameFusionConfig.min_pixels", self.min_pixels, "1 or more")
+        for name in ("min_pixels", "split_votes"):
+            if not 1 <= getattr(self, name) <= 10_000:
+                raise InvalidValueError(f"FrameFusionConfig.{name}", getattr(self, name), "1 to 10000")
 
     @staticmethod
     def of_paper() -> "FrameFusionConfig":
         """Section 3.1 alone: masks are split out of segments that contain them, what is not in the largest cluster of a
         thing is background, and nothing is filled in or held to planes.
         """
-        return FrameFusionConfig(inside=0.9, fill=False, trust=False, silent=False, hidden=(0.0, 0.0), flat=False)
+        return FrameFusionConfig(
+            inside=0.9, fill=False, trust=False, silent=False, hidden=(0.0, 0.0), doubt=False, split_votes=1, flat=False
+        )
 
     @staticmethod
     def of_voxbloxpp() -> "FrameFusionConfig":
         """Geometric segments take the mask that covers most of them, and that is all."""
-        return FrameFusionConfig(split=False, fill=False, trust=False, cluster=False, flat=False)
+        return FrameFusionConfig(
+            split=False, fill=False, trust=False, cluster=False, flat=False, doubt=False, split_votes=1
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

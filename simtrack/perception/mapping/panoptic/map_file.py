@@ -103,7 +103,7 @@ def _config(kind: type, values: Any) -> Any:
             continue
         value, own = values[field.name], getattr(default, field.name)
         if is_dataclass(own):
-            value = _config(type(own), value)
+            value = None if value is None and field.name == "shell" else _config(type(own), value)
         elif isinstance(own, frozenset):
             value = frozenset(map(str, value))
         elif isinstance(own, tuple):

@@ -1,5 +1,6 @@
 """The panoptic map: frames in, entities out."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Literal, TypeAlias
@@ -17,11 +18,19 @@ from simtrack.perception.mapping.panoptic.counts import (
     JointCounts,
     Observation,
     PanopticCounts,
+    SegmentEntity,
     SeparateCounts,
 )
-from simtrack.perception.mapping.panoptic.entities import EntityConfig, MapEntityMesh, extract_entities
+from simtrack.perception.mapping.panoptic.entities import (
+    EntityConfig,
+    MapEntityMesh,
+    Surface,
+    extract_entities,
+    extract_surface,
+)
 from simtrack.perception.mapping.panoptic.frame_segments import FrameFusionConfig, FrameSegments, fuse_segments
 from simtrack.perception.mapping.panoptic.regions import SwapConfig, SwappedRegions
+from simtrack.perception.mapping.panoptic.shell import ShellConfig, is_upright, shell_labels
 from simtrack.perception.mapping.panoptic.volume import Volume, VolumeConfig
 from simtrack.perception.segmentation.geometric import GeometricConfig, depth_segments
 from simtrack.perception.segmentation.panoptic import PanopticSegments
@@ -42,6 +51,9 @@ class PanopticMapConfig:
     entities: EntityConfig = field(default_factory=EntityConfig)
     joint: bool = True
     """Whether classes and instances are counted together."""
+    shell: ShellConfig | None = field(default_factory=ShellConfig)
+    """How the shell of a room is found, which weighs in on what is floor, wall and ceiling; None leaves it out. Only
+    joint counts are weighed."""
     max_depth: float = 4.0
     """Metres; farther readings are not used."""
     regularize_every: int = 10
@@ -80,7 +92,7 @@ class PanopticMapConfig:
         if method == "full":
             return config
         fusion = FrameFusionConfig.of_voxbloxpp() if method == "voxbloxpp" else FrameFusionConfig.of_paper()
-        return replace(config, joint=False, entities=EntityConfig.of_counts_alone(), fusion=fusion)
+        return replace(config, joint=False, shell=None, entities=EntityConfig.of_counts_alone(), fusion=fusion)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +188,12 @@ class PanopticMap:
         self.counts.observe(_observations(segments, labels, panoptic))
         same = self.counts.same(self.labels.canonical)
         image = labels[segments.image]
-        blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera, same, listed)
+        if self.config.fusion.doubt:
+            owner = segments.instances[segments.image]
+            image[(owner > 0) & (panoptic.image != owner)] *= -1
+        votes = np.ones(len(same), np.int16)
+        votes[labels[~segments.geometric]] = self.config.fusion.split_votes
+        blocks = self.volume.integrate(depth, frame.rgb, image, frame.intrinsics, T_map_camera, same, listed, votes)
         for label, other in self.labels.count_overlaps(met, counts[segments.geometric], least):
             self._merge(label, other)
         self.frames += 1
@@ -188,7 +205,19 @@ class PanopticMap:
         """The entities of the map, stuff first, then things, by class and number."""
         self.complete()
         self.counts.regularize()
-        return extract_entities(self.volume, self.labels.canonical, self.counts.entities(), self.config.entities)
+        surface = extract_surface(self.volume, self.config.entities.least_weight)
+        return extract_entities(surface, self.labels.canonical, self.told_segments(surface), self.config.entities)
+
+    def told_segments(self, surface: Surface) -> Mapping[int, SegmentEntity]:
+        """Global segment -> what it is part of, by what was observed of it and where it lies on the map's `surface`."""
+        alone = self.counts.entities()
+        if self.config.shell is None:
+            return alone
+        mesh, labels = surface.mesh, self.labels.canonical[surface.labels]
+        classes = [alone[label].semantic_class if label in alone else "" for label in range(len(self.labels.canonical))]
+        if not is_upright(mesh, np.array(classes, dtype=object)[labels]):
+            return alone
+        return self.counts.entities(shell_labels(mesh, labels, self.config.shell))
 
     def close(self) -> None:
         """Remove the files of what was written away."""

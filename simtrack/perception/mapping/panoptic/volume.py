@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
+import numpy.typing as npt
 
 from simtrack.contracts import Bool, CameraIntrinsics, Float32, Float64, Int32, Uint8
 from simtrack.errors import InvalidValueError
@@ -107,18 +108,20 @@ class Volume:
 
     def integrate(
         self, depth: Float32, rgb: Uint8 | None, labels: Int32, intrinsics: CameraIntrinsics, T_map_camera: Float64,
-        same: Int32 | None = None, listed: Int32 | None = None,
+        same: Int32 | None = None, listed: Int32 | None = None, votes: npt.NDArray[np.int16] | None = None,
     ) -> int:  # fmt: skip
         """Fuse one image; the results do not depend on the number of threads.
 
         Args:
             depth: (H, W), metres, 0 = no reading.
             rgb: (H, W, 3), or None.
-            labels: (H, W), of segments; 0 = none.
+            labels: (H, W), of segments; 0 = none; a negative one is taken where there is none yet, and speaks neither
+                for nor against those that are there.
             intrinsics: of the image.
             T_map_camera: (4, 4).
             same: (L,), labels with the same number support each other in a voxel; None: each stands for itself.
             listed: (B,), what `touched` has told of this image; None: it is asked.
+            votes: (L,), observations that one of a label counts for; None: one each.
 
         Returns:
             Blocks that it was fused into.
@@ -129,14 +132,16 @@ class Volume:
         if listed is None:
             listed = self.touched(depth, intrinsics, T_map_camera)
         if same is None:
-            most = max(int(self.labels[: self.count].max(initial=0)), int(labels.max(initial=0)))
+            most = max(int(self.labels[: self.count].max(initial=0)), int(np.abs(labels).max(initial=0)))
             same = np.arange(most + 1, dtype=np.int32)
+        if votes is None:
+            votes = np.ones(len(same), np.int16)
         config = self.config
         image = np.empty((0, 0, 3), np.uint8) if rgb is None else np.ascontiguousarray(rgb)
         voxel, camera = config.voxel, _camera(intrinsics)
         arguments = (
             depth, image, labels, camera, inverse(T_map_camera), voxel, config.truncation * voxel,
-            config.label_band * voxel, (_MOST_WEIGHT, _MOST_SUPPORT), same,
+            config.label_band * voxel, (_MOST_WEIGHT, _MOST_SUPPORT), same, votes,
             self.keys, self.distances, self.weights, self.colors, self.labels, self.support,
         )  # fmt: skip
         threads = nb.get_num_threads()

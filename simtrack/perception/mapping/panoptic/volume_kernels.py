@@ -127,7 +127,7 @@ def touch(depth, camera, T_map_camera, voxel, truncation, stride, keys, table, s
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 def integrate(
-    listed, depth, rgb, segments, camera, T_camera_map, voxel, truncation, band, limits, same,
+    listed, depth, rgb, segments, camera, T_camera_map, voxel, truncation, band, limits, same, votes,
     keys, distances, weights, colors, labels, support,
 ):  # fmt: skip
     """Fuse one image into the listed blocks: weighted means of distance and colour, majority of labels.
@@ -136,7 +136,8 @@ def integrate(
         listed: (B,) int32, blocks.
         depth: (H, W) float32, metres, 0 = no reading.
         rgb: (H, W, 3) uint8, or (0, 0, 3).
-        segments: (H, W) int32, label of every pixel, 0 = none.
+        segments: (H, W) int32, label of every pixel, 0 = none; a negative one is taken where there is none yet, and
+            speaks neither for nor against those that are there.
         camera: fx, fy, cx, cy.
         T_camera_map: (4, 4).
         voxel: metres.
@@ -144,6 +145,7 @@ def integrate(
         band: metres from the surface within which voxels take labels.
         limits: largest weight of a voxel, most observations that a label is remembered for.
         same: (L,) int32, labels with the same number support each other.
+        votes: (L,) int16, observations that one of a label counts for.
         keys: (C,) int64, of blocks.
         distances: (C, 512) float32, metres, positive before the surface; output, as what follows.
         weights: (C, 512) float32.
@@ -208,12 +210,14 @@ def integrate(
                     label = segments[v, u]
                     if label > 0:
                         if same[labels[block, n]] == same[label]:
-                            support[block, n] = min(np.int16(support[block, n] + 1), most_support)
+                            support[block, n] = min(np.int16(support[block, n] + votes[label]), most_support)
                         elif support[block, n] > 0:
-                            support[block, n] -= np.int16(1)
+                            support[block, n] = max(np.int16(support[block, n] - votes[label]), np.int16(0))
                         else:
                             labels[block, n] = label
-                            support[block, n] = 1
+                            support[block, n] = votes[label]
+                    elif label < 0 and labels[block, n] == 0:
+                        labels[block, n] = -label
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
