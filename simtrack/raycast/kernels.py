@@ -17,6 +17,7 @@ import numba as nb
 import numpy as np
 
 from simtrack.raycast import packets
+from simtrack.raycast.box_cone import box_cosine, nearest_in_box
 from simtrack.raycast.vector import allow, any_within, carray, gather, gather_vectors, pointer, rotate
 
 GROUP = 8
@@ -50,7 +51,7 @@ class World(NamedTuple):
     listed: np.ndarray
     """(L,) int32, ids of the other instances, or empty: there may be any number, anywhere."""
     rows: np.ndarray
-    """(M, 14) float32, by instance id: normal matrix, bounding sphere, faces."""
+    """(M, 23) float32, by instance id: normal matrix, bounding sphere, faces, half axes of the box."""
     motion: np.ndarray
     """(M, 2) int32, by instance id: first row in `keys`, number of keys (1 at rest)."""
     keys: np.ndarray
@@ -99,13 +100,14 @@ def run(count: int, serial: Any, parallel: Any, *arguments: Any) -> Any:
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def discs_of(world, pose):
-    """(L + 1, 6) float32, sensor frame: spheres of the listed instances, then of the ground, as the sensor sees them.
+    """(L + 1, 6) float32, sensor frame: the listed instances, then the ground, as the sensor sees them.
 
-    Direction, cosine and sine of the angular radius, and faces by 1 - cosine; cosine -1 and no faces where the sphere
-    holds the sensor (packets keep together among walls), or where the pose is no rigid motion.
+    A direction, cosine and sine of the angle that sphere or box takes around it, whichever is smaller, and faces of the
+    sphere by 1 - cosine. No faces where the sphere holds the sensor (packets keep together among walls), and cosine -1
+    where the box does, too, or where the pose is no rigid motion.
     """
     count = world.listed.shape[0]
-    out = np.zeros((count + 1, 6), np.float32)
+    out, ahead = np.zeros((count + 1, 6), np.float32), np.empty(3, np.float32)
     out[:, 3] = -1.0
     for a in range(3):
         for b in range(3):
@@ -120,16 +122,22 @@ def discs_of(world, pose):
         square = offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]
         rounding = np.abs(row[9:12]).sum() + np.abs(pose[:, 3]).sum() + row[12]
         radius = row[12] + np.float32(2e-6) * rounding
-        if not square > radius * radius:
+        distance, margin = np.sqrt(square), np.float32(2e-6) * rounding
+        if square > radius * radius:
+            sine = radius / distance
+            cosine = np.sqrt(np.float32(1.0) - sine * sine)
+            out[j, 5] = row[13] * (np.float32(1.0) + cosine) / (sine * sine)
+            cosine = max(cosine, box_cosine(offset, row[14:23], offset, distance, margin))
+        else:
+            distance = nearest_in_box(offset, row[14:23], ahead)
+            cosine = box_cosine(offset, row[14:23], ahead, distance, margin)
+            offset = ahead
+        if not cosine > 0.0:
             continue
-        distance = np.sqrt(square)
         for axis in range(3):
             turned = pose[0, axis] * offset[0] + pose[1, axis] * offset[1] + pose[2, axis] * offset[2]
             out[j, axis] = turned / distance
-        sine = radius / distance
-        cosine = np.sqrt(np.float32(1.0) - sine * sine)
-        out[j, 3], out[j, 4] = cosine, sine
-        out[j, 5] = row[13] * (np.float32(1.0) + cosine) / (sine * sine)
+        out[j, 3], out[j, 4] = cosine, np.sqrt(np.float32(1.0) - cosine * cosine)
     return out
 
 

@@ -58,6 +58,12 @@ class TriangleMesh:
         return centre, float(np.sqrt(((self.vertices - centre) ** 2).sum(1).max()))
 
     @cached_property
+    def half_extents(self) -> npt.NDArray[np.float64]:
+        """(3,) half the size of the box around all vertices, mesh frame, metres; `bounding_sphere` has its centre."""
+        low, high = self.vertices.min(0).astype(np.float64), self.vertices.max(0).astype(np.float64)
+        return (high - low) / 2
+
+    @cached_property
     def topology(self) -> "Topology":
         """Which faces meet where, and whether they close the mesh."""
         from simtrack.raycast.topology import Topology

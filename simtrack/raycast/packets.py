@@ -25,7 +25,7 @@ from simtrack.raycast.vector import (
     unit_normals,
 )
 
-ROW = 14
+ROW = 23
 """Numbers in a row of `simtrack.raycast.table.InstanceTable.rows`."""
 _COHERENT = np.uint32(1 << 16)
 """RTC_RAY_QUERY_FLAG_COHERENT."""

@@ -25,13 +25,16 @@ class InstanceTable:
         """(M, 4, 4) T_map_mesh, of the first motion key."""
         self.spheres: Float64 = np.zeros((0, 4))
         """(M, 4) bounding spheres in the mesh frame: centre, radius."""
+        self.halves: Float64 = np.zeros((0, 3))
+        """(M, 3) half the sizes of the boxes in the mesh frame that have the spheres' centres."""
         self.handles: npt.NDArray[np.int64] = np.zeros(0, np.int64)
         """(M,) addresses of the RTCGeometry, 0 where there is none."""
         self.buffers: npt.NDArray[np.int64] = np.zeros((0, 2), np.int64)
         """(M, 2) addresses of the float32 vertices and of the uint32 faces of the mesh."""
         self.rows: Float32 = np.zeros((0, ROW), np.float32)
-        """(M, 14): normal matrix (inverse transpose of the linear part, any positive scale), bounding sphere in the map
-        frame (of all motion keys), number of faces."""
+        """(M, 23): normal matrix (inverse transpose of the linear part, any positive scale), bounding sphere in the map
+        frame (of all motion keys), number of faces, and the half axes of the box around the mesh, map frame, from the
+        sphere's centre; infinite for what moves."""
         self.motion: Int32 = np.zeros((0, 2), np.int32)
         """(M, 2): first row in `keys`, number of keys; 1 at rest."""
         self.keys: Float32 = np.zeros((0, 3, 3), np.float32)
@@ -49,7 +52,7 @@ class InstanceTable:
         if number < have:
             return
         size = max(number + 1, 2 * have, 16)
-        for name in ("poses", "spheres", "handles", "buffers", "rows", "motion", "enabled", "rigid"):
+        for name in ("poses", "spheres", "halves", "handles", "buffers", "rows", "motion", "enabled", "rigid"):
             old = getattr(self, name)
             new = np.zeros((size, *old.shape[1:]), old.dtype)
             new[:have] = old
@@ -59,6 +62,7 @@ class InstanceTable:
         """Enter new instances, enabled and at rest."""
         self.reserve(int(numbers.max()))
         self.spheres[numbers] = [(*mesh.bounding_sphere[0], mesh.bounding_sphere[1]) for mesh in meshes]
+        self.halves[numbers] = [mesh.half_extents for mesh in meshes]
         self.buffers[numbers] = [(mesh.vertices.ctypes.data, mesh.faces.ctypes.data) for mesh in meshes]
         self.rows[numbers, 13] = [len(mesh.faces) for mesh in meshes]
         self.handles[numbers], self.enabled[numbers], self.rigid[numbers] = 0, True, False
@@ -77,7 +81,7 @@ class InstanceTable:
 
     def place(self, numbers: npt.NDArray[np.int64], poses: Float64) -> None:
         """Put instances to rest at (N, 4, 4) valid poses."""
-        arrays = self.poses, self.spheres, self.rows, self.motion, self.rigid
+        arrays = self.poses, self.spheres, self.halves, self.rows, self.motion, self.rigid
         self.members_changed |= bool(_place(numbers, poses, *arrays))
 
     def set_off(self, numbers: npt.NDArray[np.int64]) -> None:
@@ -101,6 +105,7 @@ class InstanceTable:
         way = np.linalg.norm(centres - np.repeat(centres[first], counts, axis=0), axis=1)
         self.rows[numbers, 9:12] = centres[first]
         self.rows[numbers, 12] = np.maximum.reduceat(reach + way, first)
+        self.rows[numbers, 14:] = np.inf
         self.keys = linear.astype(np.float32)
 
 
@@ -162,8 +167,8 @@ def _all_affine(poses):
 
 
 @nb.njit(cache=True, nogil=True)
-def _describe(T, sphere, row):
-    """Normal matrix and bounding sphere in the map frame."""
+def _describe(T, sphere, half, row):
+    """Normal matrix, bounding sphere and half axes of the box in the map frame."""
     sign = 1.0 if _determinant(T) > 0.0 else -1.0
     cofactors = np.empty((3, 3))
     largest = 0.0
@@ -179,6 +184,7 @@ def _describe(T, sphere, row):
         row[9 + i] = T[i, 3] + T[i, 0] * sphere[0] + T[i, 1] * sphere[1] + T[i, 2] * sphere[2]
         for j in range(3):
             row[3 * i + j] = cofactors[i, j] / largest
+            row[14 + 3 * i + j] = T[j, i] * half[i]
             total += abs(T[0, i] * T[0, j] + T[1, i] * T[1, j] + T[2, i] * T[2, j])
         square = max(square, total)
     row[12] = sphere[3] * np.sqrt(square)
@@ -195,7 +201,7 @@ def _is_rigid(T):
 
 
 @nb.njit(cache=True, nogil=True)
-def _place(numbers, poses, all_poses, spheres, rows, motion, rigid):
+def _place(numbers, poses, all_poses, spheres, halves, rows, motion, rigid):
     changed = False
     for k in range(numbers.shape[0]):
         number, T = numbers[k], poses[k]
@@ -206,5 +212,5 @@ def _place(numbers, poses, all_poses, spheres, rows, motion, rigid):
         changed |= rigid[number] != now
         rigid[number] = now
         motion[number, 0], motion[number, 1] = 0, 1
-        _describe(T, spheres[number], rows[number])
+        _describe(T, spheres[number], halves[number], rows[number])
     return changed

@@ -6,7 +6,7 @@ import trimesh
 
 from simtrack.contracts import CameraIntrinsics
 from simtrack.geometry.transforms import exp_so3, look_at, transform
-from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh, hierarchy
+from simtrack.raycast import RayBundle, RayHits, RayScene, TriangleMesh, hierarchy, kernels
 
 CAMERA = CameraIntrinsics(160, 120, 110.0, 110.0, 79.5, 59.5)
 ROOM = trimesh.creation.box((8.0, 6.0, 3.0)).subdivide().subdivide()
@@ -148,3 +148,43 @@ def test_the_ground_changes_with_poses_and_visibility() -> None:
         assert scene.add(globe) == small
         assert seen() == (small, 6.0)
     assert grounds in ({small, big, -1}, set())
+
+
+def test_what_rays_meet_lies_in_the_disc_that_the_sensor_sees_of_it() -> None:
+    rng = np.random.default_rng(4)
+    plate = trimesh.creation.box((1.0, 0.6, 0.02))
+    bundle = RayBundle.from_directions(rng.normal(size=(4000, 3)))
+    rays = bundle.directions / np.linalg.norm(bundle.directions, axis=1, keepdims=True)
+    beside = 0
+    for _ in range(40):
+        T_map_plate = transform(exp_so3(rng.normal(size=3)) @ np.diag(rng.uniform(0.5, 2.0, 3)), rng.normal(size=3))
+        place = rng.uniform(-0.6, 0.6, 3) + [0.0, 0.0, rng.choice([-0.03, 0.03, 0.3])]  # often within its sphere
+        T_map_sensor = transform(exp_so3(rng.normal(size=3)), T_map_plate[:3, :3] @ place + T_map_plate[:3, 3])
+        with RayScene(use_fallback=False) as scene:
+            scene.add(shape(plate), T_map_plate)
+            scene.add(shape(BALL), transform(translation=(9.0, 9.0, 9.0)))  # of that size: there is no ground
+            hits = scene.cast(bundle, T_map_sensor)
+            assert scene._hierarchy is not None
+            world = kernels.World(*scene._hierarchy.world)
+        disc = kernels.discs_of(world, T_map_sensor[:3].astype(np.float32))[0]
+        beside += disc[3] > -1.0
+        assert (rays[hits.instances == 0] @ disc[:3] >= disc[3] - 2e-6).all()
+    assert beside > 20
+
+
+def test_a_plate_behind_the_sensor_is_not_looked_at_though_its_sphere_holds_the_sensor() -> None:
+    plate = trimesh.creation.box((0.2, 0.2, 0.04))
+    with RayScene(use_fallback=False) as scene:
+        scene.add(shape(plate), transform(translation=(0.0, 0.0, -0.03)))
+        scene.commit()
+        assert scene._hierarchy is not None
+        world = kernels.World(*scene._hierarchy.world)
+        discs = kernels.discs_of(world, np.eye(4, dtype=np.float32)[:3])
+        cones = RayBundle.from_camera(CAMERA).cones
+        met = np.empty(len(discs), np.int64)
+        flags = [kernels.to_trace(world, cones, k, discs, 128, met)[0] for k in range(len(cones))]
+        assert not any(flags)
+        scene.set_motion(0, np.stack([np.eye(4), transform(translation=(0.0, 0.0, 0.1))]))  # its box tells no more
+        scene.commit()
+        discs = kernels.discs_of(kernels.World(*scene._hierarchy.world), np.eye(4, dtype=np.float32)[:3])
+        assert discs[0, 3] == -1.0
