@@ -62,9 +62,9 @@ class BelievedScene:
         for instance in [i for i in self._placed if i not in believed]:
             self.scene.remove(instance)
             del self._placed[instance]
+        kept = [instance for instance in believed if instance in self._placed]
+        self.scene.set_poses(kept, [believed[instance].T_map_object for instance in kept])
         for instance, track in believed.items():
             if instance not in self._placed:
                 self.scene.add(self._meshes[track.class_name], track.T_map_object, instance=instance)
                 self._placed[instance] = track.class_name
-            else:
-                self.scene.set_pose(instance, track.T_map_object)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simtrack.contracts import Bool, Float32, Float64, LidarScan, RgbdFrame
+from simtrack.contracts import Bool, Float32, LidarScan, RgbdFrame
 from simtrack.errors import InvalidValueError
 from simtrack.geometry.kinematics import KinematicTree
 from simtrack.raycast import RayBundle, RayScene, TriangleMesh
@@ -77,16 +77,15 @@ class SelfFilter:
         self.robot = robot
         self.config = config or SelfFilterConfig()
         self._scene = RayScene()
+        bodies = [link for link in robot.links if len(link.faces)]
         self._links = {
             link.name: self._scene.add(TriangleMesh(link.vertices, link.faces, source=f"link {link.name}"))
-            for link in robot.links
-            if len(link.faces)
+            for link in bodies
         }
-        self._reach = {
-            link.name: float(np.linalg.norm(link.vertices, axis=1).max()) for link in robot.links if len(link.faces)
-        }
+        self._reach = np.array([float(np.linalg.norm(link.vertices, axis=1).max()) for link in bodies])
         self._turn: _Turn | None = None
-        self._placed: dict[str, Float64] = {}
+        self._placed = np.full((len(self._links), 4, 4), np.nan)
+        """Where the links were placed, base frame."""
         self._posture: tuple[tuple[str, float], ...] | None = None
 
     def lidar_mask(self, scan: LidarScan, positions: Mapping[str, float]) -> Bool:
@@ -143,22 +142,19 @@ class SelfFilter:
         if posture == self._posture:
             return
         self._posture = posture
-        poses = self.robot.forward(positions)
-        moved = {name: poses[name] for name in self._links if name in poses and self._moved(name, poses[name])}
-        if moved:
-            self._scene.set_poses([self._links[name] for name in moved], np.array(list(moved.values())))
-            self._placed.update(moved)
+        T_base_link = self.robot.forward(positions)
+        poses = np.array([T_base_link[name] for name in self._links]).reshape(-1, 4, 4)
+        change = np.square(poses - self._placed)
+        turned, shifted = change[:, :3, :3].sum(axis=(1, 2)), change[:, :3, 3].sum(axis=1)
+        # Some point of a link may be so far from where it was placed; of one that was not yet, nothing is known.
+        near = np.sqrt(turned) * self._reach + np.sqrt(shifted) <= self.config.tolerance
+        moved = np.flatnonzero(~near)
+        if len(moved):
+            links = list(self._links.values())
+            self._scene.set_poses([links[k] for k in moved], poses[moved])
+            self._placed[moved] = poses[moved]
             if self._turn is not None:
                 self._turn.body = None
-
-    def _moved(self, name: str, T_base_link: Float64) -> bool:
-        """Whether some point of a link may be farther than the tolerance from where it was placed."""
-        if name not in self._placed:
-            return True
-        change = T_base_link - self._placed[name]
-        turned, shifted = change[:3, :3].ravel(), change[:3, 3]
-        farthest = float(np.sqrt(turned @ turned)) * self._reach[name] + float(np.sqrt(shifted @ shifted))
-        return farthest > self.config.tolerance
 
     def _own(self, measured: np.ndarray, body: np.ndarray) -> Bool:
         margin = self.config.margin + self.config.relative * np.where(np.isfinite(body), body, 0.0)

@@ -102,8 +102,9 @@ class Hierarchy:
             if self._ground is not None:
                 others[self._ground] = False
             self._others = np.flatnonzero(others).astype(np.int32)
-        rtc.embree().api.rtcCommitScene(self._top)
-        rtc.embree().check("rtcCommitScene")
+        device = rtc.embree()
+        device.api.rtcCommitScene(self._top)
+        device.check("rtcCommitScene")
         table.members_changed = False
         ground, T_ground_map = (0, -1), _IDENTITY
         if self._ground is not None:

@@ -1,5 +1,7 @@
 """The ground is traced by itself, and rays that meet no other instance's sphere skip the others: nobody can tell."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import trimesh
@@ -34,6 +36,12 @@ def baked(poses: list[np.ndarray], room: np.ndarray) -> TriangleMesh:
     vertices = np.concatenate([part.vertices for part in parts])
     first = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     return TriangleMesh(vertices, np.concatenate([part.faces + k for part, k in zip(parts, first, strict=True)]))
+
+
+def world_of(scene: RayScene) -> kernels.World:
+    assert scene._hierarchy is not None
+    fields: Any = scene._hierarchy.world
+    return kernels.World(*fields)
 
 
 def assert_same(hits: RayHits, expected: RayHits) -> None:
@@ -164,8 +172,7 @@ def test_what_rays_meet_lies_in_the_disc_that_the_sensor_sees_of_it() -> None:
             scene.add(shape(plate), T_map_plate)
             scene.add(shape(BALL), transform(translation=(9.0, 9.0, 9.0)))  # of that size: there is no ground
             hits = scene.cast(bundle, T_map_sensor)
-            assert scene._hierarchy is not None
-            world = kernels.World(*scene._hierarchy.world)
+            world = world_of(scene)
         disc = kernels.discs_of(world, T_map_sensor[:3].astype(np.float32))[0]
         beside += disc[3] > -1.0
         assert (rays[hits.instances == 0] @ disc[:3] >= disc[3] - 2e-6).all()
@@ -177,8 +184,7 @@ def test_a_plate_behind_the_sensor_is_not_looked_at_though_its_sphere_holds_the_
     with RayScene(use_fallback=False) as scene:
         scene.add(shape(plate), transform(translation=(0.0, 0.0, -0.03)))
         scene.commit()
-        assert scene._hierarchy is not None
-        world = kernels.World(*scene._hierarchy.world)
+        world = world_of(scene)
         discs = kernels.discs_of(world, np.eye(4, dtype=np.float32)[:3])
         cones = RayBundle.from_camera(CAMERA).cones
         met = np.empty(len(discs), np.int64)
@@ -186,5 +192,5 @@ def test_a_plate_behind_the_sensor_is_not_looked_at_though_its_sphere_holds_the_
         assert not any(flags)
         scene.set_motion(0, np.stack([np.eye(4), transform(translation=(0.0, 0.0, 0.1))]))  # its box tells no more
         scene.commit()
-        discs = kernels.discs_of(kernels.World(*scene._hierarchy.world), np.eye(4, dtype=np.float32)[:3])
+        discs = kernels.discs_of(world_of(scene), np.eye(4, dtype=np.float32)[:3])
         assert discs[0, 3] == -1.0

@@ -52,7 +52,8 @@ class RelationSet(Set[Relation]):
 
     def about(self, subject: str) -> list[Relation]:
         """Those of one subject; takes as long as it has ever had relations, however many others there are."""
-        return [relation for relation in self._history.ever_about(subject) if relation in self]
+        history, stamp = self._history, self._stamp
+        return [relation for relation in history.ever_about(subject) if history.held(relation, stamp)]
 
     def __repr__(self) -> str:
         return f"<{self._size} relations at {self._stamp} ns>"
@@ -149,6 +150,8 @@ class History:
 
     def held(self, relation: Relation, stamp: int) -> bool:
         """Whether a relation held at `stamp`, nanoseconds."""
+        if stamp >= self._last:  # what has ended ended before, and what holds began before
+            return relation in self._current
         return any(span.covers(stamp) for span in reversed(self._intervals.get(relation, ())))
 
     def at(self, stamp: int) -> frozenset[Relation]:

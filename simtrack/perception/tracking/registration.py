@@ -81,6 +81,7 @@ class Registration:
         self.config = config or RegistrationConfig()
         self._scene = RayScene()
         self._models: dict[int, TrackedModel] = {}
+        self._shown: set[int] = set()
         self._images = kernels.ModelImages.empty(0, 0)
         self._marks = kernels.no_marks(0, 0)
         """Where the casts of a track have hit something, or nearly: a fine one needs no other rays."""
@@ -97,6 +98,7 @@ class Registration:
     def remove(self, instance: int) -> None:
         """Take an instance out of the scene."""
         self._scene.remove(instance)
+        self._shown.discard(instance)
         del self._models[instance]
 
     def close(self) -> None:
@@ -220,8 +222,9 @@ class Registration:
         """Show the given instances and no others; take up those of `poses` that project into the image."""
         batch = _Batch(depth, intrinsics, self._models, poses, self.config)
         shown = {**(fixed or {}), **dict(zip(batch.instances, batch.poses, strict=True))}
-        for instance in self._models:
+        for instance in self._shown ^ shown.keys():
             self._scene.set_enabled(instance, instance in shown)
+        self._shown = set(shown)
         self._scene.set_poses(list(shown), list(shown.values()))
         if self._images.depth.shape != depth.shape:
             self._images = kernels.ModelImages.empty(*depth.shape)
@@ -321,14 +324,14 @@ class _Batch:
 
     def results(self, config: RegistrationConfig) -> dict[int, RegistrationResult]:
         """Results of every instance at its present pose."""
-        systematic = np.repeat([config.systematic_translation**2, config.systematic_rotation**2], 3)
+        systematic = np.diag(np.repeat([config.systematic_translation**2, config.systematic_rotation**2], 3))
         out: dict[int, RegistrationResult] = {}
         for k, instance in enumerate(self.instances):
             supported, occluded, missing, invalid = (int(n) for n in self.counts[k, kernels.SUPPORTED :])
             inliers = max(float(self.stats[k, 0]), 1e-9)
             out[instance] = RegistrationResult(
                 T_camera_object=self.poses[k].copy(),
-                covariance=self.covariance[k] + np.diag(systematic),
+                covariance=self.covariance[k] + systematic,
                 constrained=int(self.constrained[k]),
                 rays=supported + occluded + missing + invalid,
                 supported=supported,

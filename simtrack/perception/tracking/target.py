@@ -126,6 +126,8 @@ class Target:
     visible_fraction: float = 0.0
     residual: float = 0.0
     result: RegistrationResult | None = None
+    _spread: tuple[RegistrationResult, float] | None = None
+    """A registration, and the largest variance of the orientation that it found, rad^2."""
 
     @property
     def alive(self) -> bool:
@@ -148,9 +150,12 @@ class Target:
 
     def vaguer(self, angle: float) -> bool:
         """Whether its orientation has a larger standard deviation than this about some axis, radians."""
-        if self.result is None:
+        result = self.result
+        if result is None:
             return True
-        return bool(np.linalg.eigvalsh(self.result.covariance[3:, 3:])[-1] > angle**2)
+        if self._spread is None or self._spread[0] is not result:  # asked several times a frame
+            self._spread = result, float(np.linalg.eigvalsh(result.covariance[3:, 3:])[-1])
+        return self._spread[1] > angle**2
 
     def doubtful(self, config: TrackerConfig) -> bool:
         """Whether its last registration may have slid into a wrong minimum."""
