@@ -134,16 +134,18 @@ class Loop:
             if self.manipulator.busy:
                 command = replace(command, linear=self.manipulator.drive, angular=0.0)
         self._feed.clear()
+        joints, linear, angular = self._felt.joints, self._felt.linear, self._felt.angular
         for frame in simulation.advance(command, want_rgb=self.colours):
             self._feed.append(frame)
             if isinstance(frame, JointState):
-                self._felt = replace(self._felt, joints=frame)
+                joints = frame
             elif isinstance(frame, Odometry):
-                self._felt = replace(self._felt, linear=frame.linear, angular=frame.angular)
+                linear, angular = frame.linear, frame.angular
             elif isinstance(frame, RgbdFrame):
                 self._image = frame
             if self._stack is not None:
                 self._belief = self._stack.process(frame) or self._belief
+        self._felt = Proprioception(joints, linear, angular)
         return self._snapshot()
 
     def _snapshot(self) -> Snapshot:

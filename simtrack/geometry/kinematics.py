@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from simtrack.contracts import Float32, Float64, Int32
 from simtrack.geometry.transforms import exp_so3, transform
 
@@ -66,10 +64,11 @@ class KinematicTree:
 
     def pose(self, name: str, positions: Mapping[str, float]) -> Float64:
         """(4, 4) T_root_link of one link, see `forward`."""
-        links = {link.name: link for link in self.links}
-        chain = [links[name]]
-        while chain[-1].parent:
-            chain.append(links[chain[-1].parent])
+        wanted, chain = name, []
+        for link in reversed(self.links):  # children after parents
+            if link.name == wanted:
+                chain.append(link)
+                wanted = link.parent
         poses: dict[str, Float64] = {}
         for link in reversed(chain):
             poses[link.name] = _placed(link, poses, positions)
@@ -79,7 +78,7 @@ class KinematicTree:
 def _placed(link: Link, poses: Mapping[str, Float64], positions: Mapping[str, float]) -> Float64:
     """(4, 4) T_root_link of a link below those whose poses are known."""
     if link.joint is None:
-        return np.eye(4)
+        return transform()
     T = poses[link.parent] @ link.T_parent_joint
     value = float(positions.get(link.joint.name, 0.0))
     if link.joint.kind == "revolute":

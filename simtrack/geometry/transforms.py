@@ -36,10 +36,14 @@ def exp_so3(rotation_vector: Float64) -> Float64:
 
 def log_so3(rotation: Float64) -> Float64:
     """(3,) rotation vector, radians, norm in [0, pi], of a (3, 3) rotation matrix."""
-    w, x, y, z = _quaternion(np.asarray(rotation, dtype=float).tolist())
+    return np.array(_rotation_vector(np.asarray(rotation, dtype=float).tolist()))
+
+
+def _rotation_vector(m: list[list[float]]) -> tuple[float, float, float]:
+    w, x, y, z = _quaternion(m)
     norm = sqrt(x * x + y * y + z * z)
     scale = 2.0 if norm < 1e-12 else 2.0 * atan2(norm, w) / norm
-    return np.array([scale * x, scale * y, scale * z])
+    return scale * x, scale * y, scale * z
 
 
 def quaternion_from_rotation(rotation: Float64) -> Float64:
@@ -146,7 +150,8 @@ def perturb(T: Float64, xi: Float64) -> Float64:
 
 def difference(T_to: Float64, T_from: Float64) -> Float64:
     """(6,) perturbation that leads from one transform to the other: ``perturb(T_from, xi) == T_to``."""
-    return np.concatenate([T_to[:3, 3] - T_from[:3, 3], log_so3(T_to[:3, :3] @ T_from[:3, :3].T)])
+    (a, b, c), (d, e, f) = T_to[:3, 3].tolist(), T_from[:3, 3].tolist()
+    return np.array([a - d, b - e, c - f, *_rotation_vector((T_to[:3, :3] @ T_from[:3, :3].T).tolist())])
 
 
 def orthonormal(rotation: Float64) -> Float64:

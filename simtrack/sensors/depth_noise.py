@@ -7,6 +7,7 @@ and SLAM*, ICRA 2014 (simkinect). What is marked as a choice of this project has
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -242,6 +243,7 @@ def apply_depth_noise(
     return kernels.read_depth(*flat, config.simkinect, parameters).reshape(shape)
 
 
+@lru_cache(maxsize=8)
 def _kernel_parameters(config: DepthNoiseConfig) -> "Parameters":
     from simtrack.sensors.depth_kernels import Parameters
 

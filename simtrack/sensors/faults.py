@@ -86,7 +86,7 @@ class CalibrationFaults:
             stamp = frame.stamp + round(1e9 * self.lidar_time_offset)
             frame = replace(frame, stamp=stamp, T_base_lidar=self.believed_lidar(frame.T_base_lidar))
             return _mirrored(frame) if self.lidar_mirrored else frame
-        if isinstance(frame, JointState):
+        if isinstance(frame, JointState) and self.encoder_bias:
             bias = np.array([self.encoder_bias.get(name, 0.0) for name in frame.names])
             return replace(frame, positions=frame.positions + bias)
         return frame

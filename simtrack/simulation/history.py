@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 
 from simtrack.contracts import Float64
 from simtrack.errors import InvalidValueError
@@ -13,6 +14,18 @@ if TYPE_CHECKING:
 KEY_NS = 4_000_000
 """Nanoseconds between keys. At 2 m/s^2 a straight line between keys errs by 4 micrometres."""
 _FIRST_CAPACITY = 2048
+
+
+@njit(cache=True, nogil=True)
+def _turn_alike(row, previous, quaternions):
+    """Give the quaternions of a row, at indices (Q, 4), the signs with which they are nearest to those before."""
+    for q in quaternions:
+        product = 0.0
+        for i in q:
+            product += row[i] * previous[i]
+        if product < 0.0:
+            for i in q:
+                row[i] *= -1.0
 
 
 class History:
@@ -67,8 +80,7 @@ class History:
         row[nq + 3 * nmocap :] = data.mocap_quat.ravel()
         if self._count:
             # Antipodal quaternions are the same rotation, but not to a straight line between them.
-            flip = np.einsum("ij,ij->i", row[self._quaternions], previous[self._quaternions]) < 0
-            row[self._quaternions[flip]] *= -1.0
+            _turn_alike(row, previous, self._quaternions)
         self._count += 1
 
     def _make_room(self) -> None:

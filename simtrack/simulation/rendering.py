@@ -280,9 +280,10 @@ class EmbreeRenderer:
     def _cast(self, data: "mujoco.MjData") -> tuple[RayHits, Float64]:
         """What the pixels meet, at any distance, and the camera's pose; images of one moment share one cast."""
         T_map_camera = transform(data.xmat[self._body].reshape(3, 3), data.xpos[self._body])
-        moment = self._rays.poses(data).tobytes() + T_map_camera.tobytes()
+        poses = self._rays.poses(data)
+        moment = poses.tobytes() + T_map_camera.tobytes()
         if moment != self._moment:
-            self._rays.place(data)
+            self._rays.place(data, poses)
             self._rays.scene.cast(self._bundle, T_map_camera, min_distance=NEAR, out=self._hits)
             self._moment = moment
         return self._hits, T_map_camera

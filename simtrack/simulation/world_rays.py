@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from simtrack.contracts import Float32, Float64, Int32
 from simtrack.geometry.meshes import concatenate, transformed
@@ -46,6 +47,8 @@ class WorldRays:
         self._first = 1 if fixed else 0
         self._bodies = [instance.body for instance in self.moving]
         self._T_body_mesh = np.array([instance.T_body_mesh for instance in self.moving]).reshape(-1, 4, 4)
+        self._placed = np.full((len(self.moving), 4, 4), np.nan)
+        """Where what is at rest was put last."""
         self._face_ids = np.concatenate(ids)
         self._face_colors = np.concatenate(colors)
         self._face_albedos = self._face_colors.mean(axis=1, dtype=np.float32) / np.float32(255)
@@ -61,9 +64,15 @@ class WorldRays:
         first = self._offsets[instance]
         return self._face_ids[first : first + len(self.scene.mesh(instance).faces)]
 
-    def place(self, data: "mujoco.MjData") -> None:
-        """Move everything to where it is in `data`."""
-        self.scene.set_poses(range(self._first, self._first + len(self.moving)), self.poses(data))
+    def place(self, data: "mujoco.MjData", poses: Float64 | None = None) -> None:
+        """Move everything to where it is in `data`; its `poses`, if they are known."""
+        wanted = self.poses(data) if poses is None else poses
+        self._rest(np.flatnonzero((wanted != self._placed).any(axis=(1, 2))), wanted)
+
+    def _rest(self, chosen: npt.NDArray[np.int64], poses: Float64) -> None:
+        """Put some of what moves to rest, by their places in `moving`, at their `poses`, of all that moves."""
+        self.scene.set_poses((chosen + self._first).tolist(), poses[chosen])
+        self._placed[chosen] = poses[chosen]
 
     def poses(self, data: "mujoco.MjData") -> Float64:
         """(I, 4, 4) T_map_mesh of what moves, in the order of `moving`."""
@@ -73,9 +82,11 @@ class WorldRays:
         """Let everything move through keys (K of (I, 4, 4), see `poses`) during ray time 0 to 1."""
         tracks = np.stack(keys, axis=1)
         still = np.abs(tracks - tracks[:, :1]).max(axis=(1, 2, 3)) < STILL
+        first = tracks[:, 0]
+        self._rest(np.flatnonzero(still & (first != self._placed).any(axis=(1, 2))), first)
         numbers = np.arange(self._first, self._first + len(tracks))
-        self.scene.set_poses(numbers[still].tolist(), tracks[still, 0])
         self.scene.set_motions(numbers[~still].tolist(), tracks[~still])
+        self._placed[~still] = np.nan
 
     def ids(self, hits: RayHits) -> Int32:
         """(N,) index into `World.names` of what each ray hit, -1 = nothing."""
