@@ -1,7 +1,7 @@
 """What is really the case, at any moment so far. Nothing that estimates may import this."""
 
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -97,7 +97,7 @@ class GroundTruth:
         """What the pixels of the last images met, where rays rendered them."""
         self._full: RayBundle | None = None
         self._seen: tuple[int, dict[str, Visibility]] | None = None
-        """The last answer of `visibility`: detector and evaluation ask about the same images."""
+        """The last answers of `visibility`: detector and evaluation ask about the same images."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -154,20 +154,31 @@ class GroundTruth:
 
     # ------------------------------------------------------------------------------------------------------- visibility
 
-    def visibility(self, stamp: int) -> dict[str, Visibility]:
-        """How much of each object (catalogue and clutter) the camera sees; objects behind it are not seen at all."""
-        if self._seen is None or self._seen[0] != stamp:
-            self._seen = stamp, self._look(stamp)
-        return dict(self._seen[1])
+    def visibility(self, stamp: int, names: Collection[str] | None = None) -> dict[str, Visibility]:
+        """How much of each object (catalogue and clutter) the camera sees; objects behind it are not seen at all.
 
-    def _look(self, stamp: int) -> dict[str, Visibility]:
+        Args:
+            stamp: nanoseconds.
+            names: of the objects that are asked about, all if None; what is no object is left out.
+        """
+        if self._seen is None or self._seen[0] != stamp:
+            self._seen = stamp, {}
+        wanted = [name for name in self._world.objects if names is None or name in names]
+        if missing := {name for name in wanted if name not in self._seen[1]}:
+            self._seen[1].update(self._look(stamp, missing))
+        return {name: self._seen[1][name] for name in wanted}
+
+    def _look(self, stamp: int, wanted: Collection[str]) -> dict[str, Visibility]:
         self._history.load(stamp, self._scratch)
         T_map_camera = body_pose(self._scratch, self._sensors["camera"])
         names, poses = self._object_poses()
         T_camera_object = inverse(T_map_camera) @ poses
-        owners, rays, pixels, area = silhouette_rays(self._corners, T_camera_object, self._intrinsics)
+        asked = np.array([k for k, name in enumerate(names) if name in wanted], np.int32)
+        owners, rays, pixels, size = silhouette_rays(self._corners[asked], T_camera_object[asked], self._intrinsics)
         if not len(rays):
-            return dict.fromkeys(names, Visibility(0, 0.0))
+            return dict.fromkeys(wanted, Visibility(0, 0.0))
+        owners, area = asked[owners], np.zeros(len(names))
+        area[asked] = size
         directions = rays @ T_map_camera[:3, :3].T.astype(np.float32)
         # Each object alone: they stand far apart from one another, and each ray starts in front of its own.
         alone, offsets = self._objects_apart(names, poses, np.flatnonzero(area))
@@ -199,6 +210,7 @@ class GroundTruth:
         return {
             name: Visibility(round(visible[k] * float(area[k])), visible[k] / max(whole[k], 1))
             for k, name in enumerate(names)
+            if name in wanted
         }
 
     def _rendered(self, stamp: int, pixels: Int32) -> tuple[Int32, Float32]:

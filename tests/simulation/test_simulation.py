@@ -179,6 +179,16 @@ def test_visibility_agrees_with_the_id_image(resting: Simulation) -> None:
     assert seen["relay"].fraction > 0.9
 
 
+def test_visibility_of_some_objects_is_that_of_all_of_them(resting: Simulation) -> None:
+    truth = resting.truth
+    everything = truth.visibility(resting.now)
+    for names in ({"relay"}, set(), {"relay", "nothing"}, set(everything)):
+        truth._seen = None
+        some = truth.visibility(resting.now, names)
+        assert some == {name: seen for name, seen in everything.items() if name in names}
+        assert truth.visibility(resting.now) == everything  # the rest is looked at when it is asked for
+
+
 def test_a_rendered_image_tells_what_is_visible_as_rays_of_its_own_do(small_scene: MakeScene) -> None:
     """The image of a stamp is looked up instead of being cast again; the two agree up to rays along an edge."""
     with Simulation(small_scene(), seed=3, renderer="embree") as simulation:

@@ -1,6 +1,6 @@
 """A keypoint detector that answers from ground truth with the errors of a trained network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Protocol
 
@@ -108,8 +108,8 @@ class TruthSource(Protocol):
         """True state at a stamp."""
         ...
 
-    def visibility(self, stamp: int) -> Mapping[str, ObjectVisibility]:
-        """Visible share of every object in the camera at a stamp."""
+    def visibility(self, stamp: int, names: Collection[str]) -> Mapping[str, ObjectVisibility]:
+        """Visible share of the named objects in the camera at a stamp; what is no object is missing."""
         ...
 
 
@@ -137,14 +137,13 @@ class OracleDetector:
         """Detect the objects in the image of a frame; neither its pixels nor the regions are looked at."""
         rng = np.random.default_rng([self._seed, frame.stamp % (1 << 62)])
         taken = frame.stamp - self._clock_offset
-        scene, visibility = self._truth.at(taken), self._truth.visibility(taken)
+        scene = self._truth.at(taken)
+        known = {name for name, thing in scene.objects.items() if thing.class_name in self._models}
+        visibility = self._truth.visibility(taken, known)
         T_camera_map = inverse(scene.T_map_camera)
         found: list[Detection] = []
-        for name in sorted(scene.objects):
-            model = self._models.get(scene.objects[name].class_name)
-            seen = visibility.get(name)
-            if model is None or seen is None:
-                continue
+        for name in sorted(known & visibility.keys()):
+            model, seen = self._models[scene.objects[name].class_name], visibility[name]
             T_camera_object = T_camera_map @ scene.objects[name].T_map_object
             detection = self._observe(model, T_camera_object, seen.fraction, frame.intrinsics, rng)
             if detection is not None:
