@@ -321,6 +321,9 @@ class _ContactLog:
         self._sets: list[tuple[np.ndarray, np.ndarray]] = []
         self._count = 0
         self._last = b""
+        self._told: tuple[tuple[int, int], tuple[frozenset[tuple[str, str]], frozenset[tuple[str, str]]]]
+        self._told = (-1, -1), (frozenset(), frozenset())
+        """The last answer, and which of the sets it is of."""
 
     def append(self, data: "mujoco.MjData") -> None:
         contact = data.contact
@@ -347,7 +350,13 @@ class _ContactLog:
 
     def at(self, stamp: int) -> tuple[frozenset[tuple[str, str]], frozenset[tuple[str, str]]]:
         low = max(0, bisect_right(self._keys, stamp - CONTACT_WINDOW) - 1)
-        high = max(low + 1, bisect_right(self._keys, stamp + CONTACT_WINDOW))
+        high = min(max(low + 1, bisect_right(self._keys, stamp + CONTACT_WINDOW)), len(self._sets))
+        if self._told[0] != (low, high):  # mostly so: things rest
+            self._told = (low, high), self._between(low, high)
+        return self._told[1]
+
+    def _between(self, low: int, high: int) -> tuple[frozenset[tuple[str, str]], frozenset[tuple[str, str]]]:
+        """Names of what was supported by what, and of what touched what, in some of the sets."""
         supports = {(int(a), int(b)) for kept in self._sets[low:high] for a, b in kept[0]}
         touches = {(int(a), int(b)) for kept in self._sets[low:high] for a, b in kept[1]}
 
