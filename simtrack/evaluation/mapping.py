@@ -302,12 +302,12 @@ def score_metrics(scores: MapScores) -> Metrics:
                 found = unmeasured("1", "no class of this kind") if means is None else measured(means[k], "1")
                 metrics[f"{kind}.{group}{name}"] = found
     for kind, table in (("instances", scores.instances), ("boxes", scores.boxes), ("boxes_refined", scores.refined)):
-        for suffix, lenient in (("", False), (".lenient", True)):
-            value = mean_precision(table, lenient)
+        for group, lenient in (("", False), ("", True), ("paper_classes.", False)):
+            value = mean_precision(table, lenient, PAPER_CLASSES if group else None)
             missing = unmeasured("1", "nothing to be found")
             if kind == "boxes_refined" and not scores.nodes:
                 value, missing = None, unmeasured("1", "the contact graph was not built")
-            metrics[f"{kind}.map50{suffix}"] = missing if value is None else measured(value, "1")
+            metrics[f"{kind}.{group}map50{'.lenient' * lenient}"] = missing if value is None else measured(value, "1")
     metrics["surface.accuracy.median"] = measured(scores.accuracy[0], "m")
     metrics["surface.accuracy.p95"] = measured(scores.accuracy[1], "m")
     metrics["surface.completeness"] = measured(scores.completeness, "1")

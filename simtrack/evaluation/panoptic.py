@@ -15,7 +15,7 @@ Definitions
   reached; classes never predicted are left out.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -335,9 +335,12 @@ def scored_classes(
     return counts
 
 
-def mean_precision(counts: Mapping[str, ScoredClass], lenient: bool = False) -> float | None:
-    """Mean of the classes' average precision; None if there is no class."""
-    values = [value for c in counts.values() if (value := c.average_precision(lenient)) is not None]
+def mean_precision(
+    counts: Mapping[str, ScoredClass], lenient: bool = False, only: Collection[str] | None = None
+) -> float | None:
+    """Mean of the classes' average precision, of some classes if `only` names them; None if there is no class."""
+    chosen = [c for name, c in counts.items() if only is None or name in only]
+    values = [value for c in chosen if (value := c.average_precision(lenient)) is not None]
     return float(np.mean(values)) if values else None
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from simtrack.evaluation.mapping import MapScores, class_means
 from simtrack.evaluation.panoptic import (
+    PAPER_CLASSES,
     PanopticCount,
     PanopticEntity,
     ScoredClass,
@@ -51,6 +52,16 @@ def test_the_truth_itself_is_perfect() -> None:
     assert np.allclose(found.iou, np.eye(3)) and found.accuracy.max() == 0.0
     assert mean_precision(scored_classes(TRUE.entities, TRUE, found.iou)) == 1.0
     assert np.allclose(box_iou(TRUE.entities, TRUE), np.eye(3))
+
+
+def test_means_over_the_papers_classes_leave_the_others_out() -> None:
+    counts = {
+        "chair": ScoredClass(((0.9, True),), 1),
+        "cup": ScoredClass((), 4),
+        "lamp": ScoredClass(((0.5, False),), 0),
+    }
+    assert mean_precision(counts) == 0.5 and mean_precision(counts, only=PAPER_CLASSES) == 1.0
+    assert mean_precision(counts, only=("bed",)) is None
 
 
 def test_the_true_meshes_are_perfect_however_small_and_close_they_are() -> None:
