@@ -63,7 +63,7 @@ class SegmenterErrors:
         for name in ("wrong_class", "missed", "flicker", "split", "merged", "leak", "filled"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InvalidValueError(f"SegmenterErrors.{name}", getattr(self, name), "a share, 0 to 1")
-        for name in ("small", "leak_size", "filled_size", "ragged"):
+        for name in ("small", "leak_size", "filled_size", "stuff", "ragged"):
             if not 0.0 <= getattr(self, name) < 1e4:
                 raise InvalidValueError(f"SegmenterErrors.{name}", getattr(self, name), "0 or more, finite")
         if not 0.0 < self.epoch < 1e6:
