@@ -339,7 +339,7 @@ def test_floor_and_walls_are_told_from_geometry_where_masks_disagree() -> None:
     seen = (of_face > 2) | (of_face == 1) & (normals[:, 2] > 0.5) | (of_face == 2) & (normals[:, 0] > 0.5)
     shown = Mesh(surface.vertices, surface.faces[seen])
     found = shell_labels(shown, of_face[seen])
-    assert found == {1: "floor", 2: "wall", 3: "", 4: ""}
+    assert {label: part.kind for label, part in found.items()} == {1: "floor", 2: "wall", 3: "", 4: ""}
 
     names = np.array(["", "floor", "wall", "cabinet", "board"], dtype=object)[of_face[seen]]
     lying = Mesh(surface.vertices[:, [2, 0, 1]], surface.faces[seen])  # as a camera sees it whose poses nobody stated
@@ -351,6 +351,9 @@ def test_floor_and_walls_are_told_from_geometry_where_masks_disagree() -> None:
     for name, times in (("table", 5), ("floor", 3), ("wall", 2)):
         for _ in range(times):
             counts.observe([Observation(name, (1,))])
+    for name, times in (("board", 7), ("wall", 1)):  # larger than any board: once is enough
+        for _ in range(times):
+            counts.observe([Observation(name, (2,))])
     for name, times in (("wall", 5), ("cabinet", 3)):
         for _ in range(times):
             counts.observe([Observation(name, (3,))])
@@ -358,7 +361,8 @@ def test_floor_and_walls_are_told_from_geometry_where_masks_disagree() -> None:
     assert (alone[1].semantic_class, alone[3].semantic_class) == ("table", "wall")
     assert (told[1].semantic_class, told[3].semantic_class) == ("floor", "cabinet")
     assert (told[1].agreeing, told[1].observed) == (3, 10)
-    assert counts.entities({9: "wall"}) == alone
+    assert (alone[2].semantic_class, told[2].semantic_class) == ("board", "wall")
+    assert counts.entities({9: found[2]}) == alone
     assert shell_labels(Mesh(np.empty((0, 3)), np.empty((0, 3), np.int32)), np.empty(0, np.int32)) == {}
 
 

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from simtrack.contracts import Int32
+from simtrack.perception.mapping.panoptic.shell import OnShell
 
 BACKGROUND = ""
 """Class of what no panoptic segment covers."""
@@ -68,7 +69,7 @@ class PanopticCounts(Protocol):
         """Merge instances that are one."""
         ...
 
-    def entities(self, shell: Mapping[int, str] | None = None) -> Mapping[int, SegmentEntity]:
+    def entities(self, shell: Mapping[int, OnShell] | None = None) -> Mapping[int, SegmentEntity]:
         """Global segment -> what it is part of; background is missing.
 
         Args:
@@ -104,9 +105,6 @@ class CountsConfig:
     """... and how many times the frames it must be in which each was a thing of its own."""
     labelled: float = 0.35
     """Share of the frames that see a segment in which something must cover it, for it not to be background."""
-    shell: float = 3.0
-    """How many times as much observations count that take a segment for what of the room's shell it lies on, and how
-    many times less those that take it for stuff which it does not lie on."""
 
 
 class JointCounts:
@@ -203,7 +201,7 @@ class JointCounts:
                 self._merge_instances(name, instances[max(first, second)], instances[min(first, second)])
         self._merge_seen_as_one()
 
-    def entities(self, shell: Mapping[int, str] | None = None) -> Mapping[int, SegmentEntity]:
+    def entities(self, shell: Mapping[int, OnShell] | None = None) -> Mapping[int, SegmentEntity]:
         """Eq. 6; stuff is weighed by whether a segment lies on the shell of the room."""
         lies_on = {} if shell is None else shell
         found = (
@@ -268,12 +266,13 @@ class JointCounts:
             self._entities[label] = self._found_entity(label)
         return self._entities[label]
 
-    def _found_entity(self, label: int, lies_on: str | None = None) -> SegmentEntity | None:
+    def _found_entity(self, label: int, lies_on: OnShell | None = None) -> SegmentEntity | None:
         classes: dict[str, float] = defaultdict(float)
         counts = self.phi.get(label, {})
         for (name, _), count in counts.items():
-            stuff = lies_on is not None and name in self.config.stuff
-            weight = 1.0 if not stuff else self.config.shell if name == lies_on else 1.0 / self.config.shell
+            weight = 1.0
+            if lies_on is not None and name in self.config.stuff:
+                weight = lies_on.weight if name == lies_on.kind else 1.0 / lies_on.weight
             classes[name] += weight * count
         name = _winner(classes, self.config.labelled)
         if name is None:
@@ -356,7 +355,7 @@ class SeparateCounts:
     def regularize(self) -> None:
         """Nothing: instances are not merged."""
 
-    def entities(self, shell: Mapping[int, str] | None = None) -> Mapping[int, SegmentEntity]:
+    def entities(self, shell: Mapping[int, OnShell] | None = None) -> Mapping[int, SegmentEntity]:
         """The likeliest instance of each segment; its class is the one that most was counted for on its segments.
 
         The shell does not weigh in: Voxblox++ knows of none.

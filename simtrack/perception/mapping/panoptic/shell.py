@@ -36,9 +36,15 @@ class ShellConfig:
     """... but for this share of its area."""
     share: float = 0.7
     """Share of the surface of a segment that must lie on planes of one kind."""
+    weight: float = 3.0
+    """How many times as much observations count that take a segment for what it lies on, and how many times less those
+    that take it for stuff which it does not lie on."""
+    sure_area: float = 3.0
+    """Square metres of a segment on a plane of the shell that is larger than what hangs on walls: one observation that
+    says so is enough there."""
 
     def __post_init__(self) -> None:
-        for name in ("least_area", "near", "behind", "reach"):
+        for name in ("least_area", "near", "behind", "reach", "weight", "sure_area"):
             if not 0.0 < getattr(self, name) < 1e6:
                 raise InvalidValueError(f"ShellConfig.{name}", getattr(self, name), "a finite number > 0")
         for name in ("level", "upright", "allowed", "share"):
@@ -49,7 +55,20 @@ class ShellConfig:
 _PLANES = PlaneConfig(distance=0.03, samples=20000, min_fraction=0.02, min_share=0.004, max_planes=60)
 
 
-def shell_labels(surface: Mesh, labels: Int32, config: ShellConfig | None = None) -> Mapping[int, str]:
+@dataclass(frozen=True, slots=True)
+class OnShell:
+    """What of the shell a segment lies on."""
+
+    kind: str
+    """"floor", "wall", "ceiling", or "" where it lies on none."""
+    weight: float
+    """Of observations that say so, and one over that of observations of other stuff."""
+
+
+_SURE = 1e6
+
+
+def shell_labels(surface: Mesh, labels: Int32, config: ShellConfig | None = None) -> Mapping[int, OnShell]:
     """Which segments lie on the shell of a room.
 
     Args:
@@ -58,7 +77,7 @@ def shell_labels(surface: Mesh, labels: Int32, config: ShellConfig | None = None
         config: settings, the defaults if None.
 
     Returns:
-        Segment -> "floor", "wall", "ceiling", or "" where it lies on none.
+        Segment -> what it lies on, for all that have surface.
     """
     config = config or ShellConfig()
     if not len(surface.faces):
@@ -73,15 +92,15 @@ def shell_labels(surface: Mesh, labels: Int32, config: ShellConfig | None = None
     ]
     size = int(labels.max()) + 1
     total = np.bincount(labels, areas, minlength=size)
-    found = dict.fromkeys(np.flatnonzero(total[1:]).astype(int) + 1, "")
+    found = dict.fromkeys((np.flatnonzero(total[1:]) + 1).tolist(), OnShell("", config.weight))
     for kind in ("floor", "wall", "ceiling"):
         on = np.zeros(len(areas), bool)
         for _, plane in (each for each in planes if each[0] == kind):
             on |= (np.abs(plane.distance(centres)) <= config.near) & (normals @ plane.normal > 0.8)
         own = np.bincount(labels[on], areas[on], minlength=size)
         for label in np.flatnonzero(own[1:] > config.share * total[1:]).tolist():
-            found[label + 1] = kind
-    return {int(label): kind for label, kind in found.items()}
+            found[label + 1] = OnShell(kind, _SURE if own[label + 1] >= config.sure_area else config.weight)
+    return found
 
 
 def is_upright(surface: Mesh, classes: npt.NDArray[np.object_]) -> bool:
