@@ -106,8 +106,8 @@ def room_source(
     room = settled_room(seed, kind)
     shot = RoomFilm(room, film, film_seed)
     labels = LatestLabels()
-    errs = int(np.random.SeedSequence([film_seed, seed, 0x45727273]).generate_state(1)[0])  # of each room its own
-    oracle = OracleSegmenter(labels, [e.semantic_class for e in room.entities], strength, errs)
+    error_seed = int(np.random.SeedSequence([film_seed, seed, 0x45727273]).generate_state(1)[0])  # of each room its own
+    oracle = OracleSegmenter(labels, [e.semantic_class for e in room.entities], strength, error_seed)
 
     def frames() -> Iterator[MapFrame]:
         for seen in shot:

@@ -6,7 +6,10 @@ import numpy as np
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_in_box(offset, axes, out):
-    """Distance to the nearest point of a box whose half axes are at right angles; `out` (3,) leads there."""
+    """Distance to the nearest point of a box whose half axes are at right angles; `out` (3,) leads there.
+
+    `offset` (3,) leads from the sensor to the centre, `axes` (9,) are the half axes in a row; float32, metres.
+    """
     square = 0.0
     for i in range(3):
         out[i] = offset[i]

@@ -315,12 +315,12 @@ def test_readings_beside_the_mask_of_their_segment_are_not_its_own() -> None:
     image = segments.image.copy()
     image[60:] = 0  # the lower half of the image was not found
     half = replace(segments, image=image)
-    for doubt in (True, False):
+    for masked in (True, False):
         config = PanopticMapConfig.of_method("full", VOXEL)
-        panoptic_map = PanopticMap(replace(config, fusion=replace(config.fusion, doubt=doubt, fill=False)))
+        panoptic_map = PanopticMap(replace(config, fusion=replace(config.fusion, masked=masked, fill=False)))
         assert panoptic_map.integrate(frame, T, half, segments.image).status is Status.OK
         support = panoptic_map.volume.support[panoptic_map.volume.labels > 0]
-        assert (support == 1).any() and (support == 0).any() == doubt
+        assert (support == 1).any() and (support == 0).any() == masked
 
 
 def test_floor_and_walls_are_told_from_geometry_where_masks_disagree() -> None:

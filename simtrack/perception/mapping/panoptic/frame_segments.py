@@ -53,7 +53,7 @@ class FrameFusionConfig:
     hidden: tuple[float, float] = (0.4, 0.2)
     """Metres from the largest cluster, and share of its readings, up to which what is cut off from it is taken for a
     part of it to which the way is hidden, as the foot of a table is below its top; zeros: never, as in the paper."""
-    doubt: bool = True
+    masked: bool = True
     """Whether readings of a segment beside the mask that it took say nothing of its surface: a book that was not found
     in an image is in one segment with the table and not in its mask ..."""
     split_votes: int = 2
@@ -90,14 +90,21 @@ class FrameFusionConfig:
         thing is background, and nothing is filled in or held to planes.
         """
         return FrameFusionConfig(
-            inside=0.9, fill=False, trust=False, silent=False, hidden=(0.0, 0.0), doubt=False, split_votes=1, flat=False
+            inside=0.9,
+            fill=False,
+            trust=False,
+            silent=False,
+            hidden=(0.0, 0.0),
+            masked=False,
+            split_votes=1,
+            flat=False,
         )
 
     @staticmethod
     def of_voxbloxpp() -> "FrameFusionConfig":
         """Geometric segments take the mask that covers most of them, and that is all."""
         return FrameFusionConfig(
-            split=False, fill=False, trust=False, cluster=False, flat=False, doubt=False, split_votes=1
+            split=False, fill=False, trust=False, cluster=False, flat=False, masked=False, split_votes=1
         )
 
 

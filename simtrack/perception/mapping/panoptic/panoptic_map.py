@@ -188,7 +188,7 @@ class PanopticMap:
         self.counts.observe(_observations(segments, labels, panoptic))
         same = self.counts.same(self.labels.canonical)
         image = labels[segments.image]
-        if self.config.fusion.doubt:
+        if self.config.fusion.masked:
             owner = segments.instances[segments.image]
             image[(owner > 0) & (panoptic.image != owner)] *= -1
         votes = np.ones(len(same), np.int16)

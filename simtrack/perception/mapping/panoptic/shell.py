@@ -66,6 +66,7 @@ class OnShell:
 
 
 _SURE = 1e6
+"""Weight of an observation that is enough."""
 
 
 def shell_labels(surface: Mesh, labels: Int32, config: ShellConfig | None = None) -> Mapping[int, OnShell]:
